@@ -132,22 +132,24 @@ STATE_VALUE_NAMES = re.compile(
 #: What the action is called: alone, or (hybrid policies, torch exports) by its kind.
 ACTION_NAMES = tuple(name for name, role in OUTPUT_NAMES.items() if role is Role.ACTION)
 
-#: Constants that ML-Agents left in its graphs from 0.3 (memory_size) and 0.6 (the others) on.
+# What ML-Agents calls the constants in its graphs, which its players and checkers look up: memory_size from 0.3 on, the
+# others from 0.6, the trainer's version from 0.17; the last two in torch's exports, 0.23 on.
+VERSION_NUMBER, MEMORY_SIZE = "version_number", "memory_size"
+IS_CONTINUOUS, ACTION_SHAPE = "is_continuous_control", "action_output_shape"
+CONTINUOUS_SHAPE, DISCRETE_SHAPE = "continuous_action_output_shape", "discrete_action_output_shape"
+TRAINER_VERSION = ("trainer_major_version", "trainer_minor_version", "trainer_patch_version")
 CONSTANT_NAMES = (
-    "version_number",
-    "is_continuous_control",
-    "memory_size",
-    "action_output_shape",
-    "trainer_major_version",
-    "trainer_minor_version",
-    "trainer_patch_version",
-    # torch, 0.23 on
-    "continuous_action_output_shape",
-    "discrete_action_output_shape",
+    VERSION_NUMBER,
+    IS_CONTINUOUS,
+    MEMORY_SIZE,
+    ACTION_SHAPE,
+    *TRAINER_VERSION,
+    CONTINUOUS_SHAPE,
+    DISCRETE_SHAPE,
 )
 
 #: The constants that may hold several numbers: the sizes of the branches (a row of float32 in torch exports).
-LISTED_CONSTANTS = ("discrete_action_output_shape",)
+LISTED_CONSTANTS = (DISCRETE_SHAPE,)
 #: What a constant is in policy.json.
 Constant: TypeAlias = int | float | list[int]
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 
+from signatures.roles import VERSION_NUMBER
+
 #: What ``version_number`` says from release 17 (0.26.0) on.
 TORCH_VERSION_3 = 3
 
@@ -24,7 +26,7 @@ def generation(constants: Mapping[str, int | float], placeholders: Collection[st
     parts = [constants.get(f"trainer_{p}_version") for p in ("major", "minor", "patch")]
     if all(p is not None for p in parts):
         return "ML-Agents " + ".".join(str(int(p)) for p in parts if p is not None)
-    version = constants.get("version_number")
+    version = constants.get(VERSION_NUMBER)
     if version == 1:
         return "ML-Agents 0.6"
     if version == 2:

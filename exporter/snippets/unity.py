@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 from exporter.snippets.contract import Bundle, branch_lines, number_names
 from signatures.records import dataclass
-from signatures.roles import Role
+from signatures.roles import ACTION_SHAPE, IS_CONTINUOUS, MEMORY_SIZE, VERSION_NUMBER, Role
 from signatures.spec import TensorSpec
 
 
@@ -39,7 +39,7 @@ _INTERNAL = (
     Generation("0.5", True, 2, True, True, True, "Vector Observation Node Name", "Visual Observation Placeholder Name"),
 )
 _FIXED = ("vector_observation", "prev_action", "epsilon", "action_masks", "recurrent_in")
-_NEEDED = ("version_number", "is_continuous_control", "memory_size", "action_output_shape")
+_NEEDED = (VERSION_NUMBER, IS_CONTINUOUS, MEMORY_SIZE, ACTION_SHAPE)
 
 
 def internal_brain(bundle: Bundle) -> str:
@@ -151,7 +151,7 @@ def _faults(bundle: Bundle, generation: Generation) -> list[str]:
     board = any(s.role is Role.VECTOR and len(s.shape) > 2 for s in signature.inputs)
     hybrid, remembers = len(bundle.heads) > 1, signature.memory is not None
     counted = not bundle.heads[0].is_continuous and _action(bundle).dtype != "int64"
-    asked = [n for n in ("memory_size", "sequence_length") if f"{_scope(bundle)}{n}" not in bundle.nodes]
+    asked = [n for n in (MEMORY_SIZE, "sequence_length") if f"{_scope(bundle)}{n}" not in bundle.nodes]
     wanted = f"export with --for tfsharp-{generation.name[-3:]}"
     unfed = "" if previous is None else f"{previous.name} {list(previous.shape)}".replace("None", "agents")
     told = (
@@ -172,7 +172,7 @@ def _learning_brain(bundle: Bundle) -> str:
     signature = bundle.signature
     odd = [s.name for s in signature.inputs if s.name not in _FIXED and not s.name.startswith("visual_observation_")]
     missing = [name for name in _NEEDED if name not in bundle.nodes]
-    if not odd and not missing and signature.constants.get("version_number") == 1:
+    if not odd and not missing and signature.constants.get(VERSION_NUMBER) == 1:
         return f"ML-Agents 0.6: drop {bundle.name}.bytes on the Model of the Learning Brain; it finds the rest itself"
     wrong = f"it wants {', '.join(missing)}" if missing else "it wants version_number 1"
     why = f"it does not know {', '.join(odd)}" if odd else wrong

@@ -26,7 +26,7 @@ from converters.graph.nodes import Node, TensorShape
 from converters.graph.types import BATCH, FLOAT32, INT32
 from converters.policy.policy import Policy
 from signatures.records import dataclass
-from signatures.roles import Role
+from signatures.roles import ACTION_SHAPE, IS_CONTINUOUS, MEMORY_SIZE, VERSION_NUMBER, Role
 from signatures.spec import TensorSpec
 
 
@@ -147,13 +147,13 @@ def _lookup_nodes(generation: Generation, found: Heads, width: int, size: int) -
     """Nodes that the C# side looks up and that no other node reads."""
     constants: dict[str, int] = {}
     if size and generation.memory_constant:
-        constants["memory_size"] = size
+        constants[MEMORY_SIZE] = size
     if generation.version is not None:
         constants = {
-            "version_number": generation.version,
-            "memory_size": size,
-            "is_continuous_control": int(found.continuous is not None),
-            "action_output_shape": width,
+            VERSION_NUMBER: generation.version,
+            MEMORY_SIZE: size,
+            IS_CONTINUOUS: int(found.continuous is not None),
+            ACTION_SHAPE: width,
         }
     nodes = [Node(name, "Const", value=np.array(value, np.int32)) for name, value in constants.items()]
     if size and generation.memory_constant and generation.version is None:

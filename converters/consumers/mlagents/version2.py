@@ -17,7 +17,15 @@ from converters.consumers.mlagents import input_mapping as feeding
 from converters.consumers.mlagents.naming import Dressing
 from converters.consumers.mlagents.output_mapping import Heads, branches, continuous_rows, heads, log_probabilities
 from converters.policy.policy import Policy
-from signatures.roles import Role
+from signatures.roles import (
+    ACTION_SHAPE,
+    CONTINUOUS_SHAPE,
+    DISCRETE_SHAPE,
+    IS_CONTINUOUS,
+    MEMORY_SIZE,
+    VERSION_NUMBER,
+    Role,
+)
 
 _VERSION = 2
 VECTOR = "vector_observation"
@@ -39,8 +47,8 @@ def dress(policy: Policy, profile: str) -> Policy:
     masks = feeding.take_masks(dressing)
     feeding.take_previous_action(dressing)
     dressing.take_over(lambda spec: feeding.drawn_inside(dressing, spec))
-    dressing.constants["version_number"] = np.array([_VERSION], np.float32)
-    dressing.constants["memory_size"] = np.array([0], np.float32)
+    dressing.constants[VERSION_NUMBER] = np.array([_VERSION], np.float32)
+    dressing.constants[MEMORY_SIZE] = np.array([0], np.float32)
     _give_actions(dressing, heads(dressing), masks)
     return dressing.finish(None)
 
@@ -66,15 +74,15 @@ def _give_actions(dressing: Dressing, found: Heads, masks: str | None) -> None:
     constants = dressing.constants
     if found.continuous is not None:
         drawn, _, width = continuous_rows(dressing, found.continuous)
-        constants["continuous_action_output_shape" if both else "action_output_shape"] = np.array([width], np.float32)
+        constants[CONTINUOUS_SHAPE if both else ACTION_SHAPE] = np.array([width], np.float32)
         dressing.give("continuous_actions" if both else "action", drawn, Role.CONTINUOUS, found.continuous.source)
     if found.discrete is not None:
         scores = branches(dressing, found.discrete, masks)
         total = np.array([sum(scores.sizes)], np.float32)
-        constants["discrete_action_output_shape" if both else "action_output_shape"] = total
+        constants[DISCRETE_SHAPE if both else ACTION_SHAPE] = total
         given = log_probabilities(dressing, found.discrete, scores)
         dressing.give("discrete_actions" if both else "action", given, Role.LOG_PROBS, found.discrete.source)
     if both:
         dressing.notes.append("continuous_actions and discrete_actions are read by release 11 and later")
     else:
-        constants["is_continuous_control"] = np.array([found.continuous is not None], np.float32)
+        constants[IS_CONTINUOUS] = np.array([found.continuous is not None], np.float32)

@@ -16,7 +16,7 @@ from converters.consumers.mlagents.memory import give_memory, previous_action, t
 from converters.consumers.mlagents.naming import Dressing
 from converters.consumers.mlagents.output_mapping import branches, continuous_rows, heads, samples
 from converters.policy.policy import Policy
-from signatures.roles import Role
+from signatures.roles import CONTINUOUS_SHAPE, DISCRETE_SHAPE, MEMORY_SIZE, VERSION_NUMBER, Role
 
 _VERSION = 3
 _DETERMINISTIC = "deterministic_"
@@ -39,19 +39,19 @@ def dress(policy: Policy, profile: str, *, feeds_previous: bool = True, transpos
     state = take_memory(dressing, carried, _rows)
     dressing.take_over(lambda spec: feeding.drawn_inside(dressing, spec))
     found = heads(dressing)
-    dressing.constants["version_number"] = np.array([_VERSION], np.float32)
-    dressing.constants["memory_size"] = np.array([state.size], np.float32)
+    dressing.constants[VERSION_NUMBER] = np.array([_VERSION], np.float32)
+    dressing.constants[MEMORY_SIZE] = np.array([state.size], np.float32)
     plain: list[tuple[str, str]] = []
     if found.continuous is not None:
         drawn, without, width = continuous_rows(dressing, found.continuous)
-        dressing.constants["continuous_action_output_shape"] = np.array([width], np.float32)
+        dressing.constants[CONTINUOUS_SHAPE] = np.array([width], np.float32)
         dressing.give("continuous_actions", drawn, Role.CONTINUOUS, found.continuous.source)
         plain.append(("continuous_actions", without))
     if found.discrete is not None:
         scores = branches(dressing, found.discrete, masks)
         drawn, best = samples(dressing, scores)
         role = Role.DETERMINISTIC if found.discrete.role is Role.DETERMINISTIC else Role.SAMPLED
-        dressing.constants["discrete_action_output_shape"] = np.array([scores.sizes], np.float32)
+        dressing.constants[DISCRETE_SHAPE] = np.array([scores.sizes], np.float32)
         dressing.give("discrete_actions", drawn, role, found.discrete.source)
         plain.append(("discrete_actions", best))
     for name, without in plain:  # behind the actions, which a signature has first

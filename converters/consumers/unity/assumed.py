@@ -8,10 +8,8 @@ from collections.abc import Sequence
 
 from converters.consumers.unity.findings import UnityThrows
 from converters.consumers.unity.model import (
-    DISCRETE_SHAPE,
     FIRST_VERSION,
     RECURRENT_IN,
-    VERSION,
     CheckedModel,
     InputView,
     truncate,
@@ -20,6 +18,7 @@ from converters.consumers.unity.onnx_file import OnnxFile
 from converters.consumers.unity.rules import EPSILON, MASKS, PREVIOUS, SEQUENCE, VECTOR
 from converters.consumers.unity.settings import Brain, sensors_of
 from converters.formats.barracuda.format import NnModel, four_axes
+from signatures.roles import DISCRETE_SHAPE, VERSION_NUMBER
 
 _NOT_SENSED = frozenset({MASKS, PREVIOUS, EPSILON, SEQUENCE, RECURRENT_IN})
 #: Cameras have up to so many channels.
@@ -74,7 +73,7 @@ def _actions(model: CheckedModel, previous: int) -> tuple[int, tuple[int, ...]]:
         continuous = max(model.continuous_size, 0)
     with contextlib.suppress(UnityThrows):
         together = max(model.discrete_size, 0)
-    version, branches = model.constant(VERSION), model.constant(DISCRETE_SHAPE)
+    version, branches = model.constant(VERSION_NUMBER), model.constant(DISCRETE_SHAPE)
     single = version is not None and bool(version.size) and truncate(version[0]) == FIRST_VERSION
     if not single and branches is not None:
         return continuous, tuple(max(truncate(n), 0) for n in branches)

@@ -19,9 +19,6 @@ from converters.consumers.unity.model import (
     ACTION,
     CONTINUOUS,
     DISCRETE,
-    DISCRETE_SHAPE,
-    MEMORY_SIZE,
-    VERSION,
     CheckedModel,
     InputView,
     truncate,
@@ -29,6 +26,7 @@ from converters.consumers.unity.model import (
 from converters.consumers.unity.onnx_file import Dims, OnnxFile, attributes
 from converters.formats.barracuda.format import NnModel, four_axes
 from signatures.records import dataclass
+from signatures.roles import DISCRETE_SHAPE, MEMORY_SIZE, VERSION_NUMBER
 
 _TO_NCHW = (0, 3, 1, 2)
 _INITIAL_H = 5
@@ -69,7 +67,7 @@ class BarracudaModel(CheckedModel):
     @property
     def version(self) -> int:
         """The API version; a NullReferenceException where the file has none."""
-        return self._first(VERSION)
+        return self._first(VERSION_NUMBER)
 
     @property
     def memory_size(self) -> int:
@@ -78,7 +76,7 @@ class BarracudaModel(CheckedModel):
 
     def fetched_outputs(self, deterministic: bool) -> tuple[str, ...]:
         """The outputs that a player fetches; finding them reads the version too."""
-        self._first(VERSION)
+        self._first(VERSION_NUMBER)
         return super().fetched_outputs(deterministic)
 
 

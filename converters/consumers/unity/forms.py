@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from converters.consumers.unity.layout import reads_flat
 from converters.consumers.unity.model import ACTION, CONTINUOUS
 from converters.consumers.unity.scene import Port, Scene
+from signatures.roles import MEMORY_SIZE
 
 
 def sensor_size(port: Port) -> int:
@@ -108,7 +109,7 @@ def fields(port: Port, scene: Scene) -> Mapping[str, object]:
         "batch": free,
         "expected": f"({', '.join('d0' if d is None else str(d) for d in declared)})",
         "received": f"({', '.join(map(str, ('N', *lengths)))})",
-        "memory_size": scene.model.memory_size,
+        MEMORY_SIZE: scene.model.memory_size,
         "namespace": scene.consumer.namespace,
         "profile": scene.consumer.profile,
     }

@@ -8,10 +8,13 @@ from typing import ClassVar
 import numpy as np
 
 from signatures.records import dataclass
+from signatures.roles import (
+    ACTION_SHAPE,
+    CONTINUOUS_SHAPE,
+    DISCRETE_SHAPE,
+    IS_CONTINUOUS,
+)
 
-VERSION, MEMORY_SIZE = "version_number", "memory_size"
-CONTINUOUS_SHAPE, DISCRETE_SHAPE = "continuous_action_output_shape", "discrete_action_output_shape"
-IS_CONTINUOUS, ACTION_SHAPE = "is_continuous_control", "action_output_shape"
 ACTION, CONTINUOUS, DISCRETE = "action", "continuous_actions", "discrete_actions"
 DETERMINISTIC = "deterministic_"
 RECURRENT_IN, RECURRENT_OUT = "recurrent_in", "recurrent_out"

@@ -18,13 +18,13 @@ from converters.consumers.unity.model import (
     CONTINUOUS,
     DETERMINISTIC,
     DISCRETE,
-    MEMORY_SIZE,
     RECURRENT_IN,
     RECURRENT_OUT,
 )
 from converters.consumers.unity.rules import EPSILON, MASKS, PREVIOUS, SEQUENCE
 from converters.consumers.unity.scene import Port, Scene
 from signatures.records import dataclass
+from signatures.roles import MEMORY_SIZE
 
 #: Every observation that one of the agent's sensors is written into; every input but those of one number.
 OBSERVATION, ANY = "(observation)", "(any input)"

@@ -12,24 +12,19 @@ from converters.consumers.unity.consumers import Checks, Consumer
 from converters.consumers.unity.findings import Finding, Severity, warning
 from converters.consumers.unity.model import (
     ACTION,
-    ACTION_SHAPE,
     CONTINUOUS,
-    CONTINUOUS_SHAPE,
     DETERMINISTIC,
     DISCRETE,
-    DISCRETE_SHAPE,
     FIRST_VERSION,
-    IS_CONTINUOUS,
     LAST_VERSION,
-    MEMORY_SIZE,
     RECURRENT_IN,
-    VERSION,
     CheckedModel,
     InputView,
     action_output,
     truncate,
 )
 from converters.consumers.unity.settings import Brain, Sensor
+from signatures.roles import ACTION_SHAPE, CONTINUOUS_SHAPE, DISCRETE_SHAPE, IS_CONTINUOUS, MEMORY_SIZE, VERSION_NUMBER
 
 VECTOR, VISUAL = "vector_observation", "visual_observation_"
 MASKS, PREVIOUS, EPSILON, SEQUENCE = "action_masks", "prev_action", "epsilon", "sequence_length"
@@ -105,7 +100,7 @@ def version_error(model: CheckedModel, profile: str) -> Finding | None:
     if text is None:
         return None
     fix = f"no retraining is needed: --for {profile} writes version {LAST_VERSION}, its memory included"
-    return Finding(Severity.ERROR, text, f"constant {VERSION}", fix)
+    return Finding(Severity.ERROR, text, f"constant {VERSION_NUMBER}", fix)
 
 
 # ------------------------------------------------------------------ what must be there before anything is looked at
@@ -123,12 +118,12 @@ def _another_version(version: int, profile: str) -> Finding:
             f"Version of the trainer the model was trained with ({version}) is not compatible with the Brain's version "
             f"({FIRST_VERSION})."
         )
-    return Finding(Severity.ERROR, text, f"constant {VERSION}", f"no retraining is needed: use --for {profile}")
+    return Finding(Severity.ERROR, text, f"constant {VERSION_NUMBER}", f"no retraining is needed: use --for {profile}")
 
 
 def _missing_constants(model: CheckedModel, deterministic: bool, profile: str, known: Checks) -> Findings:
     """Each would end the check; the first does."""
-    for name in (VERSION, MEMORY_SIZE):
+    for name in (VERSION_NUMBER, MEMORY_SIZE):
         if model.constant(name) is None:
             yield warning(
                 f'Required constant "{name}" was not found in the model file.',

@@ -20,20 +20,15 @@ from converters.consumers.unity.barracuda_model import trim_index
 from converters.consumers.unity.consumers import Consumer
 from converters.consumers.unity.findings import Thrown, UnityThrows, null_reference
 from converters.consumers.unity.model import (
-    ACTION_SHAPE,
     CONTINUOUS,
-    CONTINUOUS_SHAPE,
     DISCRETE,
-    DISCRETE_SHAPE,
-    IS_CONTINUOUS,
-    MEMORY_SIZE,
-    VERSION,
     CheckedModel,
     InputView,
     truncate,
 )
 from converters.consumers.unity.onnx_file import Dims, OnnxFile, attributes
 from signatures.records import dataclass
+from signatures.roles import ACTION_SHAPE, CONTINUOUS_SHAPE, DISCRETE_SHAPE, IS_CONTINUOUS, MEMORY_SIZE, VERSION_NUMBER
 
 _SINGLE, _INT32 = "Single", "Int32"
 
@@ -102,7 +97,7 @@ class SentisModel(CheckedModel):
     @cached_property
     def version(self) -> int:
         """The API version; −1 where there is none, or none above 0."""
-        number = self._first_of_shape(VERSION)
+        number = self._first_of_shape(VERSION_NUMBER)
         return number if number > 0 else -1
 
     @cached_property
@@ -117,7 +112,7 @@ def of_onnx(file: OnnxFile, consumer: Consumer) -> SentisModel:
     def name_of(name: str) -> str:
         return trim_index(name) if consumer.strips_zero else name
 
-    read = (VERSION, MEMORY_SIZE, CONTINUOUS_SHAPE, DISCRETE_SHAPE, IS_CONTINUOUS, ACTION_SHAPE)
+    read = (VERSION_NUMBER, MEMORY_SIZE, CONTINUOUS_SHAPE, DISCRETE_SHAPE, IS_CONTINUOUS, ACTION_SHAPE)
     values = {name_of(n): file.trial_value(n) for n in file.outputs if name_of(n) in read}
     return SentisModel(
         tuple(_input(name_of(i.name), i.dims or ()) for i in file.inputs),

@@ -22,7 +22,7 @@ from converters.graph.nodes import Graph, NameScope
 from converters.graph.types import FLOAT32, INT32, INT64
 from signatures.errors import DamagedFileError, ExportModelError, SignatureError
 from signatures.records import dataclass
-from signatures.roles import ACTION_NAMES, OUTPUT_NAMES, Role
+from signatures.roles import ACTION_NAMES, ACTION_SHAPE, OUTPUT_NAMES, VERSION_NUMBER, Role
 
 MEMORY_IN, MEMORY_OUT = "recurrent_in", "recurrent_out"
 _INTEGER_INPUTS = ("prev_action",)
@@ -64,7 +64,7 @@ class _Reader:
         #: what could not be translated, and is read by nothing that is needed so far
         self.failed: dict[str, ExportModelError] = {}
         self.needed = _upstream(model, self.layers)
-        self.draws = (model.number("version_number") or 0) >= _DRAWS
+        self.draws = (model.number(VERSION_NUMBER) or 0) >= _DRAWS
 
     def read(self) -> Reading:
         memories = {m.input for m in self.model.memories}
@@ -96,7 +96,7 @@ class _Reader:
         The converter of some 0.7 previews bypassed slices: every branch then holds the numbers of all branches. Where
         they could be put back (``slices.py``), it is.
         """
-        wanted, action = self.model.number("action_output_shape"), self.values.get("action")
+        wanted, action = self.model.number(ACTION_SHAPE), self.values.get("action")
         if not self.model.from_python or wanted is None or action is None or action.size == wanted:
             return
         raise DamagedFileError(

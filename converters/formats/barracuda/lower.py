@@ -39,7 +39,17 @@ from converters.graph.types import BATCH, Dim
 from converters.policy.policy import Policy
 from signatures.errors import SignatureError
 from signatures.records import dataclass
-from signatures.roles import ACTION_NAMES, CONSTANT_NAMES, Role
+from signatures.roles import (
+    ACTION_NAMES,
+    ACTION_SHAPE,
+    CONSTANT_NAMES,
+    CONTINUOUS_SHAPE,
+    DISCRETE_SHAPE,
+    IS_CONTINUOUS,
+    MEMORY_SIZE,
+    VERSION_NUMBER,
+    Role,
+)
 from signatures.spec import TensorSpec
 
 #: What ML-Agents calls the layout of names and constants that is written here.
@@ -287,15 +297,15 @@ class _Lowering:
         """What ML-Agents reads before it runs the model."""
         widths = {base_name(s): self._head_width(s) for s in self.heads}
         constants: dict[str, float] = {
-            "version_number": API_VERSION,
-            "memory_size": sum(p.size for p in self.parts),
+            VERSION_NUMBER: API_VERSION,
+            MEMORY_SIZE: sum(p.size for p in self.parts),
         }
         if self.signature.action_space == "hybrid":
-            constants["continuous_action_output_shape"] = widths["continuous_actions"]
-            constants["discrete_action_output_shape"] = widths["discrete_actions"]
+            constants[CONTINUOUS_SHAPE] = widths["continuous_actions"]
+            constants[DISCRETE_SHAPE] = widths["discrete_actions"]
         else:
-            constants["is_continuous_control"] = float(self.signature.action_space == "continuous")
-            constants["action_output_shape"] = widths[base_name(self.heads[0])]
+            constants[IS_CONTINUOUS] = float(self.signature.action_space == "continuous")
+            constants[ACTION_SHAPE] = widths[base_name(self.heads[0])]
         return constants
 
     def _head_width(self, spec: TensorSpec) -> int:

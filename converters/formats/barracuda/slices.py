@@ -15,6 +15,7 @@ from dataclasses import replace
 from converters.formats.barracuda.format import Layer, NnModel
 from converters.formats.barracuda.vocabulary import Activation, LayerType
 from converters.graph.nodes import reachable
+from signatures.roles import ACTION_SHAPE
 
 _MASKS = "action_masks"
 
@@ -24,7 +25,7 @@ def with_slices(model: NnModel) -> tuple[NnModel, tuple[str, ...]]:
     where.
     """
     layers = {layer.name: layer for layer in model.layers}
-    total, parts = model.number("action_output_shape"), _parts(layers)
+    total, parts = model.number(ACTION_SHAPE), _parts(layers)
     if not model.from_python or total is None or len(parts) < 2:
         return model, ()
     above = [upstream([part], layers) for part in parts]

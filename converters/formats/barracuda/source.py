@@ -13,7 +13,7 @@ from converters.formats.barracuda.writer import PRODUCER
 from converters.formats.source import ReadOptions, SourceModel
 from converters.policy.facts import SourceFacts
 from signatures.contract import EMBEDDED
-from signatures.roles import ACTION_NAMES
+from signatures.roles import ACTION_NAMES, VERSION_NUMBER
 from signatures.spec import PolicySignature
 
 #: Suffixes that ML-Agents' converter gives to memories: the cell state and the hidden state of an LSTM; a GRU has h.
@@ -27,7 +27,7 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
     model, sliced = with_slices(parse(given.data))
     reading = to_graph(model)
     facts = SourceFacts(
-        family="ML-Agents 0.7 (preview)" if model.number("version_number") == _BEFORE_NN else None,
+        family="ML-Agents 0.7 (preview)" if model.number(VERSION_NUMBER) == _BEFORE_NN else None,
         memory_layout=_memory_layout(model),
         notes=(*_notes(model), *sliced, *reading.notes),
     )

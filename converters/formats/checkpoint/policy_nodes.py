@@ -17,7 +17,7 @@ from converters.formats.checkpoint.freeze import is_effect
 from converters.graph.nodes import Graph, Node, node_of, topological
 from converters.policy.brains import find_brains
 from signatures.errors import ExportModelError
-from signatures.roles import OUTPUT_NAMES, Constant, numbers
+from signatures.roles import OUTPUT_NAMES, TRAINER_VERSION, VERSION_NUMBER, Constant, numbers
 
 _SAMPLED = "action/Multinomial"
 _CLONED = frozenset(("action", "recurrent_out"))
@@ -57,10 +57,10 @@ def _with_action(graph: Graph) -> tuple[Graph, tuple[str, ...]]:
 
 def _is_inner(graph: Graph, scope: str, base: str, constants: Mapping[str, Constant]) -> bool:
     """Whether the trainer that wrote the graph did not export the output ``base``."""
-    if "version_number" not in constants and scope + "teacher_action" in graph:
+    if VERSION_NUMBER not in constants and scope + "teacher_action" in graph:
         return base not in _CLONED
     known = numbers(constants)
-    version = (known.get("trainer_major_version", 0), known.get("trainer_minor_version", 0))
+    version = tuple(known.get(name, 0) for name in TRAINER_VERSION[:2])
     return base == "action_probs" and version >= (0, 22)
 
 

@@ -22,7 +22,7 @@ from converters.policy.brains import depends_on_input
 from converters.policy.facts import DOUBLES_NARROWED, SourceFacts
 from converters.policy.generations import SAC_MEAN, torch_generation
 from signatures.contract import EMBEDDED
-from signatures.roles import CONSTANT_NAMES, Role
+from signatures.roles import CONSTANT_NAMES, TRAINER_VERSION, VERSION_NUMBER, Role
 
 #: What only policies (and critics) call their inputs and outputs.
 _OF_A_POLICY = re.compile(
@@ -38,7 +38,7 @@ def understand(model: OnnxModel) -> tuple[Graph, SourceFacts]:
     if text is not None:
         contract = contract_of(text)
         return redrawn(model.graph, contract), facts_of_contract(model.graph, contract, model.outputs)
-    version = model.graph.constant("version_number") if "version_number" in model.graph else None
+    version = model.graph.constant(VERSION_NUMBER) if VERSION_NUMBER in model.graph else None
     number = 0 if version is None or version.size != 1 else int(version.reshape(()))
     graph, notes = _with_rows_first(model)
     rows = 1 if model.one_row or notes else model.batch
@@ -81,7 +81,7 @@ def _image_layout(model: OnnxModel) -> str:
 
 def _of_tensorflow(model: OnnxModel, facts: SourceFacts, version: int) -> SourceFacts:
     """0.15 to 0.23. The constants of 0.15 and 0.16 are initializers; later ones tell the version by themselves."""
-    told = "trainer_major_version" in model.graph
+    told = TRAINER_VERSION[0] in model.graph
     notes = []
     if model.integer_seeds:
         notes.append(

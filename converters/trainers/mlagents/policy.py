@@ -37,7 +37,15 @@ from converters.trainers.pytorch.network import Network
 from converters.trainers.pytorch.weights import pytorch_alone
 from signatures.errors import SourceError
 from signatures.records import dataclass
-from signatures.roles import Role
+from signatures.roles import (
+    ACTION_SHAPE,
+    CONTINUOUS_SHAPE,
+    DISCRETE_SHAPE,
+    IS_CONTINUOUS,
+    MEMORY_SIZE,
+    VERSION_NUMBER,
+    Role,
+)
 
 _BODY = "network_body"
 #: Facts that the saver keeps among the weights; what of them is exported is computed from the weights here.
@@ -79,7 +87,7 @@ class _Generation:
 
 def _generation(state: State) -> _Generation:
     """What wrote the checkpoint. Raises SourceError for what is not read, by its name."""
-    version = int(np.clip(np.nan_to_num(state.number("version_number")), 0, 99))
+    version = int(np.clip(np.nan_to_num(state.number(VERSION_NUMBER)), 0, 99))
     body = f"{_BODY}._body_endoder" if state.under(f"{_BODY}._body_endoder.") else f"{_BODY}.linear_encoder"
     encoder = f"{_BODY}.observation_encoder" if state.under(f"{_BODY}.observation_encoder.rsa.") else _BODY
     preview = state.step_is_float
@@ -123,8 +131,8 @@ def to_graph(state: State, told: Sequence[tuple[int, ...]], goals: Sequence[int]
     if f"{_BODY}.lstm.lstm.weight_hh_l0" in state:
         size = 2 * state.length(f"{_BODY}.lstm.lstm.weight_hh_l0", -1)
         x, memory = net.lstm(x, net.input("recurrent_in", 1, size), f"{_BODY}.lstm.lstm")
-    net.fact("version_number", np.array([generation.version]))
-    net.fact("memory_size", np.array([0 if memory is None else net.width(memory)]))
+    net.fact(VERSION_NUMBER, np.array([generation.version]))
+    net.fact(MEMORY_SIZE, np.array([0 if memory is None else net.width(memory)]))
     names, conditional = _actions(net, generation, x)
     trainer = _trainer(state, conditional)
     if memory is not None:
@@ -136,7 +144,7 @@ def to_graph(state: State, told: Sequence[tuple[int, ...]], goals: Sequence[int]
         algorithm=trainer,
         image_layout="NCHW",
         memory_layout=() if memory is None else ("h", "c"),
-        outputs=dict.fromkeys(("version_number", "memory_size", *names)),
+        outputs=dict.fromkeys((VERSION_NUMBER, MEMORY_SIZE, *names)),
         notes=tuple(_notes(generation, sensors, joined, squashed=conditional is True, guessed=trainer is None)),
         decisions=_reasons(generation, sensors),
     )
@@ -294,8 +302,8 @@ def _actions(net: Network, generation: _Generation, x: str) -> tuple[list[str], 
         size = net.width(mean)
         if not generation.first:
             net.output("continuous_actions", value)
-            net.fact("continuous_action_output_shape", np.array([size]))
-            names += ["continuous_actions", "continuous_action_output_shape"]
+            net.fact(CONTINUOUS_SHAPE, np.array([size]))
+            names += ["continuous_actions", CONTINUOUS_SHAPE]
             if squashed and generation.by_sensor:
                 net.output("deterministic_continuous_actions", mean)
                 names.append("deterministic_continuous_actions")
@@ -306,16 +314,16 @@ def _actions(net: Network, generation: _Generation, x: str) -> tuple[list[str], 
         if not generation.first:
             net.output("discrete_actions", value)
             shape = np.array([sizes]) if generation.by_sensor else np.array([sum(sizes)])
-            net.fact("discrete_action_output_shape", shape)
-            names += ["discrete_actions", "discrete_action_output_shape"]
+            net.fact(DISCRETE_SHAPE, shape)
+            names += ["discrete_actions", DISCRETE_SHAPE]
     if not made:
         raise net.state.damaged_error("its Policy has no action", "neither a mean nor a branch is in it")
     if not generation.by_sensor and len(made) == 1:  # 0.22 to 0.25 called the one action by its old name, too
         kind, value = next(iter(made.items()))
         net.output("action", value)
-        net.fact("is_continuous_control", np.array([kind == "continuous"]))
-        net.fact("action_output_shape", np.array([net.width(value)]))
-        names = ["action", "is_continuous_control", "action_output_shape", *names]
+        net.fact(IS_CONTINUOUS, np.array([kind == "continuous"]))
+        net.fact(ACTION_SHAPE, np.array([net.width(value)]))
+        names = ["action", IS_CONTINUOUS, ACTION_SHAPE, *names]
     return names, squashed
 
 

@@ -8,6 +8,7 @@ from typing import Any
 from converters.files.torch_archive import Archive
 from converters.files.unpickle import Tensor
 from converters.trainers.pytorch.weights import Weights
+from signatures.roles import VERSION_NUMBER
 
 #: What a reader of a checkpoint can always do instead: ML-Agents writes the ONNX when it saves.
 LET_IT_EXPORT = (
@@ -33,10 +34,10 @@ class State(Weights):
 def actor_in(value: Any) -> Mapping[Any, Any] | None:
     """The actor's state dictionary in what was saved, or saved by hand; None where it is none of ML-Agents."""
     policy = value.get("Policy") if isinstance(value, dict) else None
-    if policy is None and isinstance(value, dict) and "version_number" in value:
+    if policy is None and isinstance(value, dict) and VERSION_NUMBER in value:
         policy = value
     names = [k for k in policy if isinstance(k, str)] if isinstance(policy, dict) else []
-    is_actor = "version_number" in names and any(n.startswith("network_body.") for n in names)
+    is_actor = VERSION_NUMBER in names and any(n.startswith("network_body.") for n in names)
     return policy if is_actor else None
 
 
