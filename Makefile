@@ -89,6 +89,7 @@ bench: install
 	$(BIN)/python -m tests.bench.latency
 	$(BIN)/python -m tests.bench.programs
 	$(BIN)/python -m tests.bench.verification
+	$(BIN)/python -m tests.bench.play
 	$(BIN)/python -m tests.bench.throughput --write
 	$(BIN)/python -m tests.bench.big
 
