@@ -26,7 +26,9 @@ from exporter.cli.terminal import say_lines
 
 if TYPE_CHECKING:
     from converters.compiler.options import CompileOptions
+    from exporter.export.options import ExportOptions
     from exporter.export.pipeline import ExportResult
+    from exporter.play.report import PlayReport
     from exporter.reports.entry import Entry
     from exporter.verify.options import VerifyOptions
     from signatures.errors import ExportModelError
@@ -79,6 +81,7 @@ if TYPE_CHECKING:
 @click.option("--labels", type=PATH, metavar="FILE", help="Names of observations and actions.")
 @click.option("--opset", type=int, metavar="N", help="ONNX opset (default: 15).")
 @located
+@click.option("--env", metavar="ENV", help="Play this environment with what was written (see play).")
 @click.option("--jobs", type=int, metavar="N", help="Export N sources at a time (default: 1).")
 @click.option("--cluster", metavar="ADDRESS", help="Export on the workers of a Dask cluster.")
 @click.option("--again", is_flag=True, help="With many sources, export unchanged ones too.")
@@ -103,6 +106,7 @@ def export_command(
     dtype: str,
     quantize: str | None,
     batch: int | None,
+    env: str | None,
     jobs: int | None,
     cluster: str | None,
     again: bool,
@@ -138,8 +142,12 @@ def export_command(
         storage(dtype, quantize),
         batch,
     )
-    many = again or fail_fast or is_many(sources) or address_of(out) is not None
-    if many or jobs is not None or cluster is not None:
+    many = (
+        again or fail_fast or is_many(sources) or address_of(out) is not None or jobs is not None or cluster is not None
+    )
+    if env is not None:
+        _check_playable(env, 2 if many else len(sources), runtimes, profile)
+    if many:
         from exporter.cli.fleet import run_fleet
 
         run_fleet(sources, job, jobs, cluster, again, fail_fast, console)
@@ -158,16 +166,64 @@ def export_command(
             progress.clear()
             console.result(result)
     console.whole([r.report for r in results if r.report is not None], refused=len(refused))
-    told = {"refused": [e.to_dict() for e in refused]} if refused else {}
+    played: list[PlayReport] = [] if env is None else _play(env, sources[0], results, job, console)
+    told: dict[str, object] = {"refused": [e.to_dict() for e in refused]} if refused else {}
+    told |= {"play": [p.to_dict() for p in played]} if played else {}
     console.json({"policies": [r.to_dict() for r in results], **told})
     console.write_reports(lambda: _entries(results, options.steps))
     console.next_step(results, compiling.names, profile)
     if refused:
         sys.exit(2)
-    if any(r.passed is False for r in results):
+    if any(r.passed is False for r in results) or any(p.passed is False for p in played):
         sys.exit(1)
     if any(r.report is not None and r.report.undecided for r in results):
         sys.exit(3)
+
+
+def _check_playable(env: str, sources: int, runtimes: str, profile: str | None) -> None:
+    """Raise UsageError where what is exported cannot play, before anything takes long."""
+    from exporter.play.named import world_maker
+    from signatures.errors import UsageError
+
+    if sources != 1:
+        raise UsageError("--env goes with a single source", fix="export-model play BUNDLE --env plays one bundle")
+    if profile is not None:
+        raise UsageError(
+            f"--env does not go with --for {profile}",
+            why="files with a consumer's names lack outputs that a reading of them has",
+            fix="export without --for to play; --for is held against the source by its numbers",
+        )
+    if runtimes == "none":
+        raise UsageError("--env needs runtimes", why="--verify none was given", fix="leave one of them out")
+    world_maker(env, Path())
+
+
+def _play(
+    env: str, source: Path, results: Sequence[ExportResult], job: ExportOptions, console: Console
+) -> list[PlayReport]:
+    """Play with each bundle whose formats agree; the source is the reference of the only one."""
+    from exporter.play.play import play_policy
+    from exporter.verify.options import VerifyOptions
+
+    judging = VerifyOptions(runtimes=job.verify, rules=job.parity.rules)
+    played = []
+    for result in results:
+        if result.passed is False:
+            continue
+        reference = source if len(results) == 1 else result.folder
+        with console.progress() as progress:
+            report = play_policy(
+                reference,
+                env,
+                result.folder,
+                understanding=job.compile,
+                read=job.read,
+                judging=judging,
+                progress=progress,
+            )
+        console.played(report)
+        played.append(report)
+    return played
 
 
 def _entries(results: Sequence[ExportResult], steps: int) -> list[Entry]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -31,6 +32,7 @@ from exporter.verify.verification import Participants, verify
 from signatures.batches import Arrays, Run
 from signatures.errors import ExportModelError
 from signatures.records import dataclass
+from signatures.spec import PolicySignature
 
 Progress = Callable[[str], None]
 #: The turn that no first episodes reach: its seed is that of all others.
@@ -145,15 +147,19 @@ class Match:
         def run(feeds: Arrays, fetch: Sequence[str]) -> dict[str, np.ndarray]:
             return participant.run([feeds], fetch)[0]
 
-        actor = self._actor(run, participant.runtime)
-        lacks = [
-            n for n in actor.needed_outputs(deterministic=self._options.deterministic) if n not in participant.outputs
-        ]
+        assert self.policy is not None
+        given = tuple(s for s in self.policy.signature.outputs if s.name in participant.outputs)
+        signature = replace(self.policy.signature, outputs=given)  # without log-probabilities it draws by itself
+        if [h.name for h in signature.heads] != [h.name for h in self.policy.signature.heads]:
+            signature = self.policy.signature
+        actor = self._actor(run, participant.runtime, signature)
+        wanted = actor.needed_outputs(deterministic=self._options.deterministic)
+        lacks = [name for name in wanted if name not in participant.outputs]
         if lacks:
             if ":" not in participant.format:  # a SavedModel's other signatures are for other callers
                 raise RunFailedError("cannot play", why=f"it has no output {lacks[0]!r}")
             return
-        actor = self._actor(self._acting(actor, run), participant.runtime)
+        actor = self._actor(self._acting(actor, run), participant.runtime, signature)
         try:
             self.played.append(self._beside_reference(actor, participant))
         except RunFailedError:
@@ -183,11 +189,12 @@ class Match:
         own, episodes = self._more[more], self._episodes(actor, who, more)
         return Played(name, runtime, episodes, equivalence(own.returns, episodes.returns, self.margin), own)
 
-    def _actor(self, run: Run, runtime: str) -> LoadedPolicy:
+    def _actor(self, run: Run, runtime: str, signature: PolicySignature | None = None) -> LoadedPolicy:
         assert self.policy is not None
+        signature = signature or self.policy.signature
         source = self.policy.source
         kept = source.noise_kept and bool(source.noise)
-        return LoadedPolicy(self.policy.name, self.policy.signature, run, runtime, draws_itself=kept)
+        return LoadedPolicy(self.policy.name, signature, run, runtime, draws_itself=kept)
 
     def _acting(self, actor: LoadedPolicy, run: Run) -> Run:
         """Return ``run``, asked for what a decision takes alone."""
