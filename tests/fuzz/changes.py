@@ -159,6 +159,8 @@ def _field(table: dict[str, Any], random: Random, known: list[dict[str, Any]]) -
         del table[name]
     elif isinstance(value, int):
         table[name] = random.choice((mutation.number(random, value), random.randrange(8)))
+    elif isinstance(value, float):
+        table[name] = random.choice(mutation.FLOATS)
     elif isinstance(value, str):
         table[name] = mutation.text(random, [str(t.get("name", "")).encode() for t in known]).decode("utf-8", "replace")
     elif isinstance(value, dict):
