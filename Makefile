@@ -87,6 +87,7 @@ pictures: install browser
 bench: install
 	$(BIN)/python -m tests.bench
 	$(BIN)/python -m tests.bench.latency
+	$(BIN)/python -m tests.bench.litert
 	$(BIN)/python -m tests.bench.programs
 	$(BIN)/python -m tests.bench.verification
 	$(BIN)/python -m tests.bench.play
