@@ -80,13 +80,14 @@ def _overview(entries: Sequence[Entry]) -> Markup:
     table = [
         (
             el("a", e.name, href=f"#policy-{n}"),
-            _chip(e),
-            f"{len(e.report.failures)} of {len(e.report.comparisons)}",
             *(_heat(rows.get(pair)) for pair in pairs),
+            f"{len(e.report.failures)} of {len(e.report.comparisons)}",
+            _chip(e),
         )
         for n, (e, rows) in enumerate(zip(entries, found, strict=True), 1)
     ]
-    head = ("policy", "verdict", "disagreements", *(f"{kind} · {runtime}" for kind, runtime in pairs))
+    two_lines = ([kind, el("br"), runtime] for kind, runtime in pairs)
+    head = ("policy", *two_lines, ["disagree-", el("br"), "ments"], "verdict")
     return el(
         "div",
         sections.table(
@@ -115,16 +116,23 @@ def _heat(pair: Pair | None) -> Markup:
 
 def _policy(entry: Entry, number: int, *, alone: bool) -> Markup:
     says = entry.report.sentence.partition(": ")[2]
-    return el(
-        "section",
-        el("div", el("h2", entry.name, id=f"title-{number}"), _chip(entry), class_="title"),
+    title = el("div", el("h2", entry.name, id=f"title-{number}"), _chip(entry), class_="title")
+    content = (
         el("p", f"{says[:1].upper()}{says[1:]}.", class_="lead"),
         sections.facts(entry),
         sections.again(entry),
         [section(entry) for section in _SECTIONS],
-        class_="policy only" if alone else "policy",
-        id=f"policy-{number}",
-        aria_labelledby=f"title-{number}",
+    )
+    if alone:
+        return el("section", title, content, class_="policy only", aria_labelledby=f"title-{number}")
+    # A link to what is inside of a closed part opens it.
+    failed = "" if entry.report.passed is False else None
+    return el(
+        "details",
+        el("summary", title),
+        el("section", content, id=f"policy-{number}", aria_labelledby=f"title-{number}"),
+        class_="policy",
+        open=failed,
     )
 
 

@@ -27,7 +27,7 @@ def section(title: str, *content: Child) -> Markup:
     return el("section", el("h3", title), content)
 
 
-def table(caption: str, head: Sequence[str], rows: Iterable[Sequence[Child]], numbers: Sequence[int] = ()) -> Markup:
+def table(caption: str, head: Sequence[Child], rows: Iterable[Sequence[Child]], numbers: Sequence[int] = ()) -> Markup:
     """A table that scrolls in its own box; the first cell of a row is its heading. ``numbers`` are right-aligned."""
     kinds = ["number" if i in numbers else None for i in range(len(head))]
     heads = [el("th", h, scope="col", class_=k) for h, k in zip(head, kinds, strict=True)]
@@ -43,7 +43,7 @@ def table(caption: str, head: Sequence[str], rows: Iterable[Sequence[Child]], nu
     whole = el(
         "table", el("caption", el("span", caption)), el("thead", el("tr", heads)), el("tbody", body), class_=small
     )
-    return el("div", whole, class_="scroll", tabindex=0, role="region", aria_label=caption)
+    return el("div", whole, class_="scroll", tabindex=0, role="group", aria_label=caption)
 
 
 def _wide(*content: Child) -> Markup:
@@ -156,7 +156,7 @@ def _equal_text(equal: Sequence[Finding], of: int) -> str | None:
 
 def _figure(title: str, picture: Markup | None, caption: str | None) -> Markup:
     label = f"Chart of {title}"
-    box = el("div", picture, class_="scroll", tabindex=0, role="region", aria_label=label) if picture else None
+    box = el("div", picture, class_="scroll", tabindex=0, role="group", aria_label=label) if picture else None
     return el("figure", el("h4", el("code", title)), box, el("figcaption", caption) if caption else None)
 
 
@@ -198,7 +198,7 @@ def policy_graph(entry: Entry) -> Markup | None:
     content: list[Child] = []
     blocks = blocks_of(entry.graph, outputs) if len(nodes) <= _MOST_NODES else []
     if 0 < len(blocks) <= _MOST_BLOCKS:
-        picture = el("div", charts.diagram(blocks), class_="scroll", tabindex=0, role="region", aria_label="Layers")
+        picture = el("div", charts.diagram(blocks), class_="scroll", tabindex=0, role="group", aria_label="Layers")
         content.append(el("figure", picture, class_="diagram"))
     else:
         content.append(el("p", f"{len(nodes)} nodes: too many for a picture.", class_="soft"))

@@ -139,7 +139,10 @@ def test_many_policies_begin_with_a_coloured_table_of_formats_and_runtimes() -> 
     assert set(colours) == {"heat low", "heat rounding", "heat over"}
     source = page([entry(PASSING), entry(replace(PASSING, comparisons=(replace(far[0], rounding=1e-3),)))])
     assert 'class="heat rounding"' in source
-    assert "reference · numpy" in Page(source).text
+    assert "reference" in Page(source).text
+    parts = [a for t, a in Page(page([entry(report) for report in policies])).elements if t == "details"]
+    opened = [a for a in parts if a.get("class") == "policy" and "open" in a]
+    assert len(opened) == 1 and sum(a.get("class") == "policy" for a in parts) == 3  # what failed is open
 
 
 def test_the_tolerance_is_the_middle_of_its_axis() -> None:

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
 
+from exporter.reports.page import page
 from exporter.serve.onefile import modules_of
 from exporter.serve.site import assemble, assemble_one_file
 from fixtures import path as fixture
 from tests.commands import export_model
+from tests.reports.made import FAILING, PASSING, entry
 from tests.serve.browsing import CHECKED, served, visit, with_backends
 from tests.serve.conftest import Bundle
 
@@ -82,7 +85,28 @@ def compared(report: Path) -> None:
     assert ran.status == 1, ran.err
 
 
-@pytest.mark.parametrize("write", [verified, compared], ids=["verified", "compared"])
+def many(report: Path) -> None:
+    """Twenty policies, one of which failed."""
+    policies = [PASSING] * 19 + [FAILING]
+    entries = [entry(replace(made, policy=f"policy_with_a_long_name_{n}")) for n, made in enumerate(policies)]
+    report.write_text(page(entries), encoding="utf-8")
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_a_report_on_twenty_policies_is_short_until_one_is_opened(tmp_path: Path, scheme: str) -> None:
+    report = tmp_path / "report.html"
+    policies = [replace(PASSING, policy=f"policy_{n}") for n in range(20)]
+    report.write_text(page([entry(made) for made in policies]), encoding="utf-8")
+    height, shown = "document.documentElement.scrollHeight", "document.querySelector('#policy-7').checkVisibility()"
+    for size in SIZES:
+        steps = [["viewport", *size], ["scheme", scheme], ["eval", height], ["eval", shown]]
+        *_, tall, closed = visit(report.as_uri(), steps).results
+        assert tall <= 6_000 and closed is False
+        *_, opened = visit(f"{report.as_uri()}#policy-7", [["viewport", *size], ["eval", shown]]).results
+        assert opened is True  # as a link of the table does
+
+
+@pytest.mark.parametrize("write", [verified, compared, many], ids=["verified", "compared", "many"])
 def test_the_report_is_accessible_and_fits(axe: Path, tmp_path: Path, write: Callable[[Path], None]) -> None:
     pytest.importorskip("onnxruntime")
     report = tmp_path / "report.html"
