@@ -15,7 +15,7 @@ help:
 	@echo "make install   .venv with every extra, and the locked npm packages"
 	@echo "make demo      two trained policies in four formats, compared in every runtime, with a report to look at"
 	@echo "make check     lint, types and the tests that start no runtime: two minutes, for the daily loop"
-	@echo "make test      lint, types and all tests (installs Chromium and gcc where apt-get can)"
+	@echo "make test      lint, types and all tests (installs Chromium, gcc and Mono where apt-get can)"
 	@echo "make docs      the documentation as a site in build/docs"
 	@echo "make figures   docs/figures.md anew, from ../shared (minutes), and docs/consumers.md"
 	@echo "make pictures  the pictures of the page and of a report in docs/pictures, anew, from Chromium (minutes)"
@@ -33,7 +33,7 @@ $(STAMP): pyproject.toml constraints.txt $(JS)/package-lock.json $(TESTS_JS)/pac
 	cd $(TESTS_JS) && npm ci --ignore-scripts --no-audit --no-fund --loglevel=error
 	@touch $(STAMP)
 
-# Without them the tests in a browser, and those of C headers, are skipped, so a Debian machine that may install them does.
+# Without them the tests in a browser, and those of C and C#, are skipped, so a Debian machine that may install them does.
 APT := apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends
 # $(1): commands of which one is enough; $(2): Debian's packages; $(3): what is skipped without
 define needed
@@ -47,6 +47,7 @@ browser:
 	$(call needed,"$$EXPORT_MODEL_CHROMIUM" chromium chromium-browser google-chrome google-chrome-stable,chromium,the tests in a browser)
 compiler: browser # one apt-get at a time
 	$(call needed,gcc clang,gcc libc6-dev,the tests of C headers)
+	$(call needed,mcs,mono-mcs mono-runtime,the tests of C# classes)
 
 # The first is a folder that training left, the second has an LSTM memory, which every runtime is fed back.
 OUT := exported

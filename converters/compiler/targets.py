@@ -56,7 +56,7 @@ TFJS = (*FEWER_OPS, *_LOWER_FOR_TFJS, _FUSE_ACTIVATIONS)
 TFJS_INT8 = (*FEWER_OPS, *_LOWER_FOR_TFJS, _on_roots(multiply_products), _FUSE_ACTIVATIONS)
 ONNX = (*FEWER_OPS, _FUSE, lambda graph, outputs: lower_for_importers(graph))
 LITERT = (*FEWER_OPS, _FUSE)
-C = (*FEWER_OPS, _FUSE)
+PROGRAM = (*FEWER_OPS, _FUSE)
 #: Models for one consumer stay as they were tried in it: without a Split, whether it reads one or not.
 CONSUMER_ONNX = (_on_roots(transpose_layout_views), _FUSE)
 _UNTRIED = frozenset({"Split"})

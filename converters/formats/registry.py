@@ -18,6 +18,8 @@ ROOMS = (
     "barracuda",
     "litert",
     "c",
+    "csharp",
+    "js",
     "stable_baselines3",
     "torchscript",
     "torch_checkpoint",

@@ -106,6 +106,8 @@ class Language(ABC):
         function = x.function
         if function in _INFIX:
             return self.rounded(f"({operands[0]} {_INFIX[function]} {operands[1]})", x)
+        if function == "select" and isinstance(x.operands[0], Number):
+            return operands[1 if x.operands[0].value else 2]
         if function == "select":
             return f"({operands[0]} ? {operands[1]} : {operands[2]})"
         if function == "cast":
@@ -121,18 +123,19 @@ class Language(ABC):
 
 
 class Printer:
-    """The statements of a program in the making; ``weight`` begins the name of each constant."""
+    """The statements of a program in the making; ``weight`` begins a constant's name, none is one of ``taken``."""
 
-    def __init__(self, language: Language, weight: str) -> None:
+    def __init__(self, language: Language, weight: str, taken: Sequence[str] = ()) -> None:
         self.language = language
         self.draws = self.looks_up = False
         self._weight = weight
-        self._scope = NameScope(())
+        self._taken = taken
+        self._scope = NameScope(taken)
         self._names: dict[int, str] = {}
         self._keep: list[object] = []
         self._lines: list[str] = []
         self._depth = 1
-        self._locals = NameScope(())
+        self._locals = NameScope(taken)
         self._counters: dict[int, str] = {}
 
     # ---- tensors
@@ -159,6 +162,11 @@ class Printer:
             self._stage(stage)
         return self._lines
 
+    def inputs(self, program: Program) -> list[Place]:
+        """The inputs that the statements of ``body`` or an output name."""
+        words = {*re.findall(r"\w+", "\n".join(self._lines)), *(self.name(t.place) for t in program.outputs.values())}
+        return [t.place for t in program.inputs.values() if self.name(t.place) in words]
+
     def _say(self, line: str) -> None:
         self._lines.append("    " * self._depth + line)
 
@@ -175,7 +183,7 @@ class Printer:
                 if low < high:
                     self._part(stage, each, {**bounds, id(counter): (low, high)})
             return
-        self._locals, self._counters = NameScope(()), {}
+        self._locals, self._counters, base = NameScope(self._taken), {}, self._depth
         summed = _side_by_side(stage, body)
         if summed is not None and not bounds:
             for counter in stage.counters[:-1]:
@@ -188,7 +196,7 @@ class Printer:
             for counter in stage.counters:
                 self._open(counter, *bounds.get(id(counter), (0, counter.length)))
             self._assign(stage, body)
-        for _ in range(self._depth - 1):
+        while self._depth > base:
             self._close()
 
     def _assign(self, stage: Stage, body: Expression) -> None:
@@ -264,7 +272,8 @@ class Printer:
         return [f"{tensor}[{_plus(index, i)}]" for i in range(count)]
 
     def _open(self, counter: Counter, first: int, last: int, step: int = 1) -> None:
-        name = next((c for c in _COUNTERS if c not in self._counters.values()), None) or self._locals.fresh("i")
+        used = {*self._counters.values(), *self._taken}
+        name = next((c for c in _COUNTERS if c not in used), None) or self._locals.fresh("i")
         self._counters[id(counter)] = name
         self._say(self.language.loop(name, first, last, step))
         self._depth += 1

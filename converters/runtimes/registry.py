@@ -23,6 +23,8 @@ ROOMS = (
     "js",
     "litert",
     "c",
+    "csharp",
+    "node",
     "openvino",
 )
 RUNTIMES: tuple[Runtime, ...] = tuple(

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from converters.formats.c.contract import header_of
+from converters.formats.programs.members import header_of
 from converters.runtimes.c import compiler
 from exporter.export.pipeline import ExportOptions, export
 from fixtures import path

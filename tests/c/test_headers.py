@@ -11,15 +11,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from converters.files.children.bounded import run_bounded
 from converters.files.children.process import RunFailedError
-from converters.formats.c.contract import answers, header_of
 from converters.formats.format import WriteOptions
+from converters.formats.programs.members import answers, header_of
 from converters.formats.registry import WRITTEN
 from converters.graph.nodes import Graph, Node, TensorShape
 from converters.graph.printer import comment
 from converters.graph.types import FLOAT32, INT32
 from converters.runtimes.c import COMPILERS, compiler
-from converters.runtimes.c.child import FLAGS, run_bounded
+from converters.runtimes.c.child import FLAGS
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.registry import available_runtimes
 from exporter.api import verify_bundle
@@ -131,11 +132,11 @@ def test_an_index_outside_of_its_table_is_an_error(index: int, processes: Runtim
     policy, runtimes = policy_of(Graph(nodes), ["row"]), Runtimes(processes, tmp_path)
     feeds = {"rows": np.array([index], np.int32)}
     if 0 <= index < 3:
-        for (found,) in (runtimes.c(policy, feeds), runtimes.tensorflow(policy.graph, feeds, ["row"])):
+        for (found,) in (runtimes.program("c", policy, feeds), runtimes.tensorflow(policy.graph, feeds, ["row"])):
             assert np.array_equal(found, table[[index]])
         return
     with pytest.raises(RunFailedError, match="an index of 1 inputs lies outside of the table"):
-        runtimes.c(policy, feeds)
+        runtimes.program("c", policy, feeds)
     with pytest.raises(RunFailedError, match=rf"indices\[0\] = {index} is not in \[0, 3\)"):
         runtimes.tensorflow(policy.graph, feeds, ["row"])
 

@@ -274,8 +274,10 @@ def asked_later(room: Path) -> Iterator[tuple[str, str]]:
     for found in ast.walk(tree):
         if isinstance(found, ast.Assign) and ast.unparse(found.value).startswith("defer_imports("):
             assert isinstance(found.value, ast.Call) and isinstance(found.targets[0], ast.Tuple)
-            words = [ast.literal_eval(word) for word in found.value.args[1:]]
-            modules.update(zip(map(ast.unparse, found.targets[0].elts), words, strict=True))
+            of, *words = found.value.args  # __name__, or the package of modules that rooms share
+            home = package if isinstance(of, ast.Name) else ast.literal_eval(of)
+            named = [f"{home}.{ast.literal_eval(word)}" for word in words]
+            modules.update(zip(map(ast.unparse, found.targets[0].elts), named, strict=True))
     for found in ast.walk(tree):
         if isinstance(found, ast.Attribute) and isinstance(found.value, ast.Name) and found.value.id in modules:
-            yield f"{package}.{modules[found.value.id]}", found.attr
+            yield modules[found.value.id], found.attr

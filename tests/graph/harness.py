@@ -99,18 +99,19 @@ class Runtimes:
         model.unload()
         return [results[name] for name in names]
 
-    def c(self, policy: Policy, feeds: Mapping[str, Array]) -> list[Array]:
-        """The outputs of a policy as a C header, compiled."""
-        self.need("c")
+    def program(self, key: str, policy: Policy, feeds: Mapping[str, Array]) -> list[Array]:
+        """The outputs of a policy as source code of a format, compiled where that needs it."""
+        (runtime,) = WRITTEN[key].runtimes
+        self.need(runtime)
         inputs = tuple(replace(s, role=Role.PARAMETER) for s in policy.signature.inputs)
         signature = replace(policy.signature, inputs=inputs)
         contract = Contract(
             policy.name, signature, Origin("test", "0" * 64), policy.source, {"name": "export-model", "version": "test"}
         )
-        artifact = WRITTEN["c"].artifact(replace(policy, signature=signature), WriteOptions(contract.compact()))
+        artifact = WRITTEN[key].artifact(replace(policy, signature=signature), WriteOptions(contract.compact()))
         root = self._folder / str(next(self._numbers))
         artifact.write(root)
-        model = self._pool.process("c").load(str(root / artifact.main), kind="graph", format="c")
+        model = self._pool.process(runtime).load(str(root / artifact.main), kind="graph", format=key)
         names = [s.name for s in policy.signature.outputs]
         results = model.run(dict(feeds), names)
         model.unload()

@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 import pytest
 
+from converters.formats.registry import WRITTEN
 from converters.graph.nodes import Graph, Node, TensorShape
 from converters.graph.ops.base import written_as_older
 from converters.graph.ops.samplers import reseed
@@ -101,14 +102,15 @@ def test_litert(op: str, runtime: str, runtimes: Runtimes) -> None:
     assert found == []
 
 
+@pytest.mark.parametrize("key", [key for key, form in WRITTEN.items() if form.program])
 @pytest.mark.parametrize("op", [op for op in OPS if TABLE[op].older is None])
-def test_c(op: str, runtimes: Runtimes) -> None:
+def test_source_code(op: str, key: str, runtimes: Runtimes) -> None:
     """Of known lengths, since a program is for one agent; where one hangs on an input, or without loops, refused."""
-    runtimes.need("c")
+    runtimes.need(WRITTEN[key].runtimes[0])
 
     def run(sample: Sample) -> list[Array]:
         graph = sample.with_shapes(lambda _, array: TensorShape(array.shape))
-        return runtimes.c(policy_of(graph, sample.fetches), sample.feeds)
+        return runtimes.program(key, policy_of(graph, sample.fetches), sample.feeds)
 
     found = []
     for sample in BY_OP[op]:

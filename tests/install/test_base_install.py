@@ -35,7 +35,11 @@ DEMO = {"exporter/demo/3DBall.bytes", "exporter/demo/Hallway.bytes"}
 LARGEST = 150
 #: Needs Node alone, which is beside the environment or not.
 NODES = ["js"] if shutil.which("node") else []
-COMPILERS = ["c"] if any(map(shutil.which, ("gcc", "clang"))) else []
+COMPILERS = [
+    *(["c"] if any(map(shutil.which, ("gcc", "clang"))) else []),
+    *(["csharp"] if all(map(shutil.which, ("mcs", "mono"))) else []),
+    *(["node"] if shutil.which("node") else []),
+]
 #: Python's own, in every environment that has pip.
 NOT_OURS = {"pip", "setuptools"}
 

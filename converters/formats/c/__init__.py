@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING
 from converters.formats.format import Format, defer_imports
 
 if TYPE_CHECKING:
-    from converters.formats.c import artifact as _artifact
-    from converters.formats.c import contract as _contract
     from converters.formats.c import writer as _writer
+    from converters.formats.programs import artifact as _artifact
+    from converters.formats.programs import members as _members
 else:
-    _artifact, _contract, _writer = defer_imports(__name__, "artifact", "contract", "writer")
+    (_writer,) = defer_imports(__name__, "writer")
+    _artifact, _members = defer_imports("converters.formats.programs", "artifact", "members")
 
 FORMATS = (
     Format(
@@ -22,7 +23,7 @@ FORMATS = (
         held=_artifact.held,
         ports=_artifact.ports,
         vetted=_artifact.vetted,
-        answers=_contract.answers,
+        answers=_members.answers,
         runtimes=("c",),
         program=True,
     ),

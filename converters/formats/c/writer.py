@@ -2,29 +2,18 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from converters.compiler.targets import C, prepare
 from converters.files.chunks import Pieces
-from converters.formats.c.contract import Field, Header, header_of
-from converters.formats.c.text import C_TYPES
-from converters.formats.c.text import C as Words
+from converters.formats.c.text import C_TYPES, C
 from converters.formats.format import WriteOptions
-from converters.graph.ops.table import traits
+from converters.formats.programs.members import Field
+from converters.formats.programs.plan import CLOSE, ROWS, Plan, formula, plan_of
 from converters.graph.printer import Printer
-from converters.graph.program import Program, arena_of, program_of
-from converters.graph.run import run_graph
+from converters.graph.program import arena_of
 from converters.policy.policy import Policy
-from signatures.contract import EMBEDDED
-from signatures.errors import GraphError
-from signatures.roles import Role
-
-#: Golden rows of the self test, and how far float32 may be off.
-_ROWS = 3
-_CLOSE = "1e-4f"
 
 _DRAWS = """
 /* The stream of draws: splitmix64 (Steele, Lea and Flood 2014), its top 23 bits, in the middle of their step: above 0,
@@ -52,49 +41,39 @@ static void $P_normal($P_memory *memory, float *out, int count)
 
 def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
     """The header. Raises UnsupportedOpError."""
-    header = header_of(policy.name, policy.signature)
-    outputs = [*header.outputs, *([header.next_state] if header.next_state else [])]
-    fetches = {f.spec.name: policy.fetches[f.spec.name] for f in outputs}
-    program = program_of(prepare(policy, C), policy.feeds, fetches)
-    text = _text(policy, header, program, options)
-    return {f"{policy.name}.h": Pieces(text.encode("ascii"))}
+    return {f"{policy.name}.h": Pieces(_text(policy.name, plan_of(policy, options)).encode("ascii"))}
 
 
-def _text(policy: Policy, header: Header, program: Program, options: WriteOptions) -> str:
-    p = header.prefix
-    words = Words(p)
+def _text(name: str, plan: Plan) -> str:
+    header, program = plan.header, plan.program
+    p, state = header.prefix, header.state
+    words = C(p)
     printer = Printer(words, f"{p}_w_")
     by_name = {f.spec.name: f"input->{f.name}" for f in header.inputs}
-    by_name |= {f.spec.name: f"memory->{f.name}" for f in (*header.noise, *([header.state] if header.state else []))}
-    for name, tensor in program.inputs.items():
-        printer.called(tensor.place, by_name[name])
+    by_name |= {f.spec.name: f"memory->{f.name}" for f in header.fed if f not in header.inputs}
+    for key, tensor in program.inputs.items():
+        printer.called(tensor.place, by_name[key])
     statements = printer.body(program)
     places = [stage.result.place for stage in program.stages]
     body = [
         f"    {C_TYPES[at.dtype.name]} *const {printer.name(at)} = memory->{arena_of(at.dtype)} + {at.offset};"
         for at in places
     ]
-    body += statements
-    answered = (*header.outputs, *([header.next_state] if header.next_state else []))
-    for f in answered:
-        target = f"memory->{header.state.name}" if f is header.next_state and header.state else f"output->{f.name}"
+    body = [*(["    int outside = 0;"] if printer.looks_up else []), *body, *statements]
+    body += ["    if (outside) return 1;"] if printer.looks_up else []
+    for f in header.answered:
+        target = f"memory->{state.name}" if f is header.next_state and state else f"output->{f.name}"
         source = printer.name(program.outputs[f.spec.name].place)
         body.append(f"    for (int i = 0; i < {f.size}; i++) {target}[i] = {source}[i];")
-    contract = "".join(c if c.isascii() else json.dumps(c)[1:-1] for c in options.contract)
-    contract = contract.replace("*/", "*\\/").replace("/*", "\\/*")
-    if printer.looks_up:
-        body = ["    int outside = 0;", *body[: -len(answered)], "    if (outside) return 1;", *body[-len(answered) :]]
-    chosen = next((f for f in header.outputs if f.spec.role is Role.LOG_PROBS), None)
-    sizes = policy.signature.branches
-    choose = _choose(p, chosen, sizes) if chosen is not None and sum(sizes) == chosen.size else ""
+    sizes = plan.sizes
+    choose = _choose(p, plan.chosen, sizes) if plan.chosen else ""
     draws = printer.draws or bool(header.noise) or bool(choose)
-    state = header.state
     parts = [
         f"/* {p}: a policy without a runtime. In one source file, write\n"
         f"       #define {p.upper()}_IMPLEMENTATION\n"
-        f'       #include "{policy.name}.h"\n'
+        f'       #include "{name}.h"\n'
         f"   and link the C library's maths (-lm). C99 or later, C++11 or later. Made by export-model.\n\n"
-        f"   {EMBEDDED}: {contract}\n*/",
+        f"{plan.contract}",
         f"#ifndef {p.upper()}_H\n#define {p.upper()}_H\n\n#include <stdint.h>\n\n"
         f'#ifdef __cplusplus\nextern "C" {{\n#endif',
         _struct(f"{p}_input", "What an agent observes.", map(_member, header.inputs)),
@@ -143,7 +122,7 @@ def _text(policy: Policy, header: Header, program: Program, options: WriteOption
         f"    for (int i = 0; i < agents; i++) without += {p}_act(&input[i], &memory[i], &output[i]);\n"
         f"    return without;\n}}",
         *([choose] if choose else []),
-        _selftest(policy, header, words),
+        _selftest(plan, words),
         "#endif",
     ]
     return "\n\n".join(parts) + "\n"
@@ -175,56 +154,28 @@ def _member(field: Field) -> str:
     return f"{C_TYPES[field.spec.dtype]} {field.name}[{field.size}]; /* {field.spec.role.value}, {shape or '1'} */"
 
 
-def _fed(field: Field, row: int) -> np.ndarray:
-    """What the self test feeds: the same formula stands in the header."""
-    i = np.arange(field.size)
-    if field.spec.role is Role.MASKS:
-        return np.ones(field.size)
-    return ((i * 7 + row * 5) % 17 - 8) / 8 if field.spec.dtype == "float32" else np.zeros(field.size)
-
-
-def _selftest(policy: Policy, header: Header, words: Words) -> str:
-    """Golden rows: inputs by a formula, what the kernels make of them, as far as nothing is drawn."""
-    p, graph = header.prefix, policy.graph
-    drawn = graph.descendants(n.name for n in graph.nodes if traits(n).sampler)
-    checked = [f for f in header.outputs if f.spec.dtype == "float32"]
-    checked = [f for f in checked if policy.fetches[f.spec.name].partition(":")[0] not in drawn]
-    lines, golden = list[str](), list[float]()
-    every = [*header.inputs, *header.noise, *([header.state] if header.state else [])]
-    quiet = {id(f) for f in (*header.noise, *([header.state] if header.state else []))}
-    for row in range(_ROWS if checked else 0):
-        feeds = {}
-        for f in every:
-            value = np.zeros(f.size) if id(f) in quiet else _fed(f, row)
-            shape = [1 if n is None else n for n in f.spec.shape]
-            feeds[policy.feeds[f.spec.name]] = value.astype(f.spec.dtype).reshape(shape)
-        try:
-            found = run_graph(graph, feeds, [policy.fetches[f.spec.name] for f in checked])
-        except GraphError:  # zeros are no places in order
-            golden = []
-            break
-        golden += [float(x) for f in checked for x in found[policy.fetches[f.spec.name]].reshape(-1)]
-    for f in header.inputs:
-        kind = C_TYPES[f.spec.dtype]
-        formula = "0" if kind != "float" else "(float)((i * 7 + row * 5) % 17 - 8) / 8.0f"
-        formula = "1" if f.spec.role is Role.MASKS else formula
-        lines.append(f"        for (int i = 0; i < {f.size}; i++) input.{f.name}[i] = {formula};")
+def _selftest(plan: Plan, words: C) -> str:
+    """Golden rows: inputs by a formula, what the kernels make of them."""
+    p, lines = plan.header.prefix, list[str]()
+    for f in plan.header.inputs:
+        fed = formula(f, "(float)((i * 7 + row * 5) % 17 - 8) / 8.0f")
+        lines.append(f"        for (int i = 0; i < {f.size}; i++) input.{f.name}[i] = {fed};")
     tests = [
         f"        for (int i = 0; i < {f.size}; i++, at++)\n"
         f"            if (golden[at] == golden[at] /* NaN: nothing to compare */\n"
         f"                && !(fabsf(output.{f.name}[i] - golden[at])\n"
-        f"                    <= {_CLOSE} * (1.0f + fabsf(golden[at])))) wrong++;"
-        for f in checked
+        f"                    <= {CLOSE}f * (1.0f + fabsf(golden[at])))) wrong++;"
+        for f in plan.checked
     ]
-    if not golden:
+    if not plan.golden:
         empty = f"int {p}_selftest({p}_memory *memory)\n{{\n    (void)memory;\n    return 0;\n}}"
         return f"#ifdef {p.upper()}_SELFTEST\n{empty}\n#endif"
-    rounded = [float(f"{x:.6g}") if np.isfinite(x) else np.nan for x in golden]  # NaN: not compared
-    numbers = ", ".join(words.literal(x, np.dtype(np.float32)) for x in rounded)
+    numbers = ", ".join(words.literal(x, np.dtype(np.float32)) for x in plan.golden)
     return (
         f"#ifdef {p.upper()}_SELFTEST\nint {p}_selftest({p}_memory *memory)\n{{\n"
-        f"    static const float golden[{len(golden)}] = {{{numbers}}};\n    {p}_input input;\n    {p}_output output;\n"
-        f"    int wrong = 0, at = 0;\n    for (int row = 0; row < {_ROWS}; row++) {{\n"
+        f"    static const float golden[{len(plan.golden)}] = {{{numbers}}};\n"
+        f"    {p}_input input;\n    {p}_output output;\n"
+        f"    int wrong = 0, at = 0;\n    for (int row = 0; row < {ROWS}; row++) {{\n"
         f"        {p}_reset(memory, 0);\n        memset(&input, 0, sizeof input);\n"
         + "\n".join([*lines, f"        wrong += {p}_compute(&input, memory, &output);", *tests])
         + "\n    }\n    return wrong;\n}\n#endif"

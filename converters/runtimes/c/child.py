@@ -10,7 +10,6 @@ import ctypes
 import json
 import os
 import shutil
-import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -20,11 +19,13 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from converters.files.children import confinement
+from converters.files.children.bounded import run_bounded
 from converters.files.children.child import Model, claim_stdout, serve
 from converters.files.children.frames import Tensors
-from converters.formats.c.artifact import held
-from converters.formats.c.contract import Field, Header, header_of
+from converters.formats.programs.artifact import held
+from converters.formats.programs.members import Header, header_of
 from converters.runtimes.c import compiler
+from converters.runtimes.rows import as_declared, fed_rows, row_count
 from signatures.contract import parse
 from signatures.errors import ExportModelError
 
@@ -74,37 +75,15 @@ class _Library:
         self.library.judge_reset(ctypes.c_uint64(seed))
 
     def run(self, feeds: Tensors, fetch: Sequence[str], request: Mapping[str, Any]) -> Tensors:
-        header = self.header
-        state = [header.state] if header.state else []
-        after = [header.next_state] if header.state and header.next_state else []
-        batched = [f.spec.name for f in (*header.inputs, *header.noise, *state) if f.spec.batched]
-        rows = max((len(feeds[n]) for n in batched if n in feeds), default=1)
-        fed = [_as_c(f, feeds.get(f.spec.name), rows) for f in (*header.inputs, *header.noise, *state)]
-        outputs = (*header.outputs, *after)
+        header, outputs = self.header, self.header.answered
+        rows = row_count(header, feeds)
+        fed = [fed_rows(f, feeds.get(f.spec.name), rows, _C_DTYPES) for f in header.fed]
         made = [np.zeros((rows, f.size), _C_DTYPES.get(f.spec.dtype, f.spec.dtype)) for f in outputs]
         pointers = [(ctypes.c_void_p * max(1, len(a)))(*(x.ctypes.data for x in a)) for a in (fed, made)]
         if without := self.library.judge(ctypes.c_size_t(rows), *pointers):
             raise ValueError(f"an index of {without} inputs lies outside of the table that it is looked up in")
-        found = {f.spec.name: _as_declared(f, a, rows) for f, a in zip(outputs, made, strict=True)}
+        found = {f.spec.name: as_declared(f, a, rows) for f, a in zip(outputs, made, strict=True)}
         return {name: found[name] for name in fetch}
-
-
-def _as_declared(field: Field, array: np.ndarray, rows: int) -> np.ndarray:
-    """An answer in the dtype and shape of the contract."""
-    lengths = tuple(n or 1 for n in field.spec.shape)
-    if field.spec.batched:
-        lengths = (rows, *lengths[1:])
-    declared = (array if field.spec.batched else array[-1]).astype(field.spec.dtype)
-    return np.asarray(declared.reshape(lengths))
-
-
-def _as_c(field: Field, array: np.ndarray | None, rows: int) -> np.ndarray:
-    """What is fed, row by row; zeros where nothing is."""
-    kind = _C_DTYPES.get(field.spec.dtype, field.spec.dtype)
-    if array is None:
-        return np.zeros((rows, field.size), kind)
-    flat = np.asarray(array).astype(kind).reshape(-1, field.size)
-    return np.ascontiguousarray(flat if len(flat) == rows else np.broadcast_to(flat, (rows, field.size)))
 
 
 class _Builder:
@@ -124,19 +103,6 @@ class _Builder:
         if answer["rc"]:
             raise CompileError(answer["said"][:2000])
         return file.with_suffix(".so")
-
-
-def run_bounded(command: Sequence[str], folder: Path, memory: int, seconds: int) -> subprocess.CompletedProcess[str]:
-    """Run a command whose every process has so many bytes of memory and seconds of processor time at most."""
-
-    def bound() -> None:
-        import resource
-
-        resource.setrlimit(resource.RLIMIT_DATA, (memory, memory))
-        resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
-
-    # one thread, so nothing can hold a lock across the fork
-    return subprocess.run(command, capture_output=True, text=True, check=False, cwd=folder, preexec_fn=bound)
 
 
 def _compile(program: str, folder: Path, asked: BinaryIO, answers: BinaryIO) -> None:

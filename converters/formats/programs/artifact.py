@@ -1,4 +1,4 @@
-"""An artefact that is a C header: the contract that it holds, and why a stranger's is not run."""
+"""An artefact that is source code: the contract that it holds, and why an untrusted one is not run."""
 
 from __future__ import annotations
 
@@ -7,16 +7,18 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from converters.files.fetch import read_bytes
-from converters.formats.c.contract import answers
 from converters.formats.format import Port, Ports
+from converters.formats.programs.members import answers
 from signatures.contract import EMBEDDED, parse
 from signatures.errors import DamagedFileError, UnsupportedOpError
 
+#: What a file's ending says of its format.
+WRITTEN_AS = {".h": "c", ".cs": "csharp", ".mjs": "js"}
 _MARK = f"   {EMBEDDED}: ".encode()
 
 
 def held(path: Path) -> str | None:
-    """The contract that a header of ours has as a comment. Raises SourceError."""
+    """Return the contract that a file of ours has as a comment. Raises SourceError."""
     _, found, rest = read_bytes(path).partition(_MARK)
     return rest.partition(b"\n*/")[0].decode("ascii", "replace") if found else None
 
@@ -25,14 +27,16 @@ def ports(path: Path) -> Ports:
     """What it takes and gives, as its contract says. Raises SourceError, DamagedFileError."""
     text = held(path)
     if text is None:
-        raise DamagedFileError(f"{path.name} has no contract", why="no header of export-model", fix="export it again")
+        raise DamagedFileError(
+            f"{path.name} has no contract", why="export-model did not write it", fix="export it again"
+        )
     signature = parse(json.loads(text)).signature
     wanted = answers(signature)
     return Ports(
         path,
         tuple(Port(s.name, s.dtype, s.shape) for s in signature.inputs),
         tuple(Port(s.name, s.dtype, s.shape) for s in signature.outputs if s.name in wanted),
-        {"kind": "graph", "format": "c"},
+        {"kind": "graph", "format": WRITTEN_AS[path.suffix]},
     )
 
 
@@ -41,6 +45,6 @@ def vetted(path: Path, names: Sequence[str], folder: Path) -> Path:
     raise UnsupportedOpError(
         f"{path.name} is not compiled",
         issues=[],
-        why="a header that was not made just now may hold any program",
-        fix="export the policy again with --to c, which verifies it, or compile it yourself and call its self test",
+        why="a file that was not made just now may hold any program",
+        fix="export the policy again, which verifies it, or compile it yourself and call its self test",
     )

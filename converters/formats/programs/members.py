@@ -1,4 +1,4 @@
-"""What a header calls a policy's inputs, outputs and memory: asked by its writer and by the judge that compiles it."""
+"""What source code calls a policy's inputs, outputs and memory: asked by writers and by the judges that run it."""
 
 from __future__ import annotations
 
@@ -12,12 +12,16 @@ from signatures.spec import PolicySignature, TensorSpec
 
 #: What the actor does not need.
 _REST = frozenset((Role.VALUE, Role.ACTION_PROBS, Role.LOG_PROB, Role.STD, Role.LOG_STD))
-#: Words that no field can have in C or C++.
+#: Words that no member can have in C, C++, C# or JavaScript, and those that programs use themselves.
 _KEYWORDS = tuple(
     """auto break case char const continue default do double else enum extern float for goto if inline int long
     register restrict return short signed sizeof static struct switch typedef union unsigned void volatile while class
     new delete this operator template typename public private protected virtual bool true false namespace using try
-    catch throw friend explicit export and or not xor""".split()  # noqa: SIM905  a list of sixty lines otherwise
+    catch throw friend explicit export and or not xor
+    abstract as base byte checked decimal delegate event finally fixed foreach implicit in interface internal is lock
+    null object out override params readonly ref sbyte sealed stackalloc string typeof uint ulong unchecked unsafe
+    ushort await debugger extends function import instanceof let package super var with yield arguments eval undefined
+    fround constructor floats ints longs stream""".split()  # noqa: SIM905  a list of eighty lines otherwise
 )
 
 
@@ -32,7 +36,7 @@ class Field:
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """The members of the structs: what is observed, what the memory keeps (the state, draws), what is answered."""
+    """The members: what is observed, what the memory keeps (the state, draws), what is answered."""
 
     prefix: str
     inputs: tuple[Field, ...]
@@ -40,6 +44,21 @@ class Header:
     state: Field | None
     next_state: Field | None
     outputs: tuple[Field, ...]
+
+    @property
+    def class_name(self) -> str:
+        """The name of a class."""
+        return self.prefix[0].upper() + self.prefix[1:]
+
+    @property
+    def fed(self) -> tuple[Field, ...]:
+        """All that a decision is made of."""
+        return (*self.inputs, *self.noise, *((self.state,) if self.state else ()))
+
+    @property
+    def answered(self) -> tuple[Field, ...]:
+        """All that comes of it; the next state last."""
+        return (*self.outputs, *((self.next_state,) if self.next_state else ()))
 
 
 def answers(signature: PolicySignature) -> list[str]:
@@ -67,7 +86,7 @@ def header_of(name: str, signature: PolicySignature) -> Header:
 
 
 def _fields(specs: Iterable[TensorSpec]) -> list[Field]:
-    scope = NameScope(("floats", "ints", "longs", "stream", *_KEYWORDS))
+    scope = NameScope(_KEYWORDS)
     found = []
     for spec in specs:
         word = identifier(spec.name)

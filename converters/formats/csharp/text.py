@@ -1,0 +1,106 @@
+"""The words of C# 7.3 for the loop language."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from converters.graph.printer import Language, bare, lines_of, numbers
+from converters.graph.program import Place
+from converters.graph.types import BOOL, FLOAT32, INT32, INT64
+
+#: What C# calls a dtype.
+CS_TYPES = {"float32": "float", "int32": "int", "int64": "long", "bool": "bool"}
+_SAME = {"exp": "Exp", "log": "Log", "sqrt": "Sqrt", "sin": "Sin", "cos": "Cos", "tan": "Tan", "tanh": "Tanh",
+         "floor": "Floor", "ceil": "Ceiling", "rint": "Round"}  # fmt: skip
+#: Functions that a class brings along: of floats, and of whole numbers. .NET Standard 2.0 has Math in double alone.
+_HELPERS = {
+    "Expm1": ("double x = a; return (float)(global::System.Math.Abs(x) < 1e-5 ? x + x * x / 2 "
+              ": global::System.Math.Exp(x) - 1);", ""),
+    "Log1p": ("double x = a; return (float)(global::System.Math.Abs(x) < 1e-5 ? x - x * x / 2 "
+              ": global::System.Math.Log(1 + x));", ""),
+    "Erf": ("if (!(a > -4 && a < 4)) return a > 0 ? 1 : a < 0 ? -1 : a; double term = a, sum = a; "
+            "for (int n = 1; n < 70; n++) { term *= -(double)a * a / n; sum += term / (2 * n + 1); } "
+            "return (float)(sum * 1.1283791670955126);", ""),
+    "Pow": ("return (float)global::System.Math.Pow(a, b);", ""),
+    "Max": ("return a < b || float.IsNaN(b) ? b : a;", "return a < b ? b : a;"),
+    "Min": ("return b < a || float.IsNaN(b) ? b : a;", "return b < a ? b : a;"),
+    "Abs": ("return global::System.Math.Abs(a);", "return a < 0 ? -a : a;"),
+    "Mod": ("float r = a % b; return r != 0 && (r < 0) != (b < 0) ? r + b : r;",) * 2,
+    "IntDiv": ("return (float)global::System.Math.Floor(a / b);",
+               "return a / b - (a % b != 0 && (a % b < 0) != (b < 0) ? 1 : 0);"),
+    "Within": ("", 'if (a >= 0 && a < b) return a; throw new global::System.IndexOutOfRangeException('
+               '"the index " + a + " lies outside of a table of " + b);'),
+}  # fmt: skip
+_CALLED = {"expm1": "Expm1", "log1p": "Log1p", "erf": "Erf", "pow": "Pow", "max": "Max", "min": "Min", "abs": "Abs",
+           "mod": "Mod", "intdiv": "IntDiv", "within": "Within"}  # fmt: skip
+
+
+class CSharp(Language):
+    """C# 7.3."""
+
+    def literal(self, value: float, dtype: np.dtype) -> str:
+        """A number as C# reads it, to the last bit."""
+        if dtype == BOOL:
+            return "true" if value else "false"
+        if dtype == FLOAT32:
+            if value != value or value in (np.inf, -np.inf):
+                word = "NaN" if value != value else "PositiveInfinity" if value > 0 else "NegativeInfinity"
+                return f"float.{word}"
+            text = f"{float(np.float32(value)):.9g}f"
+            return f"({text})" if text[0] == "-" else text
+        if value == np.iinfo(dtype).min:
+            return f"{CS_TYPES[dtype.name]}.MinValue"
+        text = f"{int(value)}{'L' if dtype == INT64 else ''}"
+        return f"({text})" if value < 0 else text
+
+    def declaration(self, dtype: np.dtype, name: str, value: str, *, constant: bool) -> str:
+        """A local variable."""
+        return f"{CS_TYPES[dtype.name]} {name} = {value};"
+
+    def loop(self, name: str, first: int, last: int, step: int) -> str:
+        """The head of a loop."""
+        return f"for (int {name} = {first}; {name} < {last}; {name}{'++' if step == 1 else f' += {step}'}) {{"
+
+    def cast(self, text: str, source: np.dtype, target: np.dtype) -> str:
+        """A number of another dtype; a float outside of an integer's range, which C# leaves open, is the least one."""
+        kind = CS_TYPES[target.name]
+        if source == target:
+            return text
+        if source == BOOL:
+            return f"({text} ? {self.literal(1, target)} : {self.literal(0, target)})"
+        if source != FLOAT32 or target == FLOAT32:
+            return f"(({kind}){text})"
+        name, limit = ("WholeInt", "2147483648f") if target == INT32 else ("WholeLong", "9223372036854775808f")
+        inside = f"a >= -{limit} && a < {limit}"
+        self.helpers[name] = f"static {kind} {name}(float a) {{ return {inside} ? ({kind})a : {kind}.MinValue; }}"
+        return f"{name}({bare(text)})"
+
+    def helper(self, function: str, operands: Sequence[str], dtype: np.dtype) -> str:
+        """A call of a function that the class brings along."""
+        kind = CS_TYPES[dtype.name]
+        takes = ", ".join(f"{kind} {a}" for a in "ab"[: len(operands)])
+        given = "ab"[: len(operands)]
+        name = _SAME.get(function) or _CALLED[function]
+        real = f"return ({kind})global::System.Math.{name}({', '.join(given)});"
+        if function in ("floor", "ceil", "rint") and dtype != FLOAT32:
+            said = "return a;"
+        else:
+            said = _HELPERS.get(name, ("", ""))[dtype != FLOAT32] or real
+        said = said.replace("float r", f"{kind} r")
+        self.helpers[f"{name} {kind}"] = f"static {kind} {name}({takes}) {{ {said} }}"
+        return f"{name}({', '.join(bare(o) for o in operands)})"
+
+    def draw(self) -> str:
+        """The next number of an agent's stream."""
+        return "Uniform()"
+
+    def constant(self, place: Place, name: str) -> str:
+        """The definition of a constant."""
+        assert place.value is not None
+        value = place.value.reshape(-1)
+        plain = place.dtype == FLOAT32 and np.isfinite(value).all()
+        words = numbers(value) if plain else [self.literal(x, place.dtype) for x in value.tolist()]
+        kind = CS_TYPES[place.dtype.name]
+        return f"static readonly {kind}[] {name} = {{\n    {lines_of(words)},\n}};"

@@ -1,0 +1,164 @@
+"""Policy to one C# class: every stage a loop nest, weights as static arrays, nothing to reference but System."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from converters.files.chunks import Pieces
+from converters.formats.csharp.text import CS_TYPES, CSharp
+from converters.formats.format import WriteOptions
+from converters.formats.programs.members import Field
+from converters.formats.programs.plan import CLOSE, ROWS, Plan, formula, plan_of
+from converters.graph.printer import Printer
+from converters.policy.policy import Policy
+
+_UNIFORM = """
+    /// <summary>The stream of draws, splitmix64: above 0, below 1. The same seed, the same draws as in C.</summary>
+    float Uniform()
+    {
+        unchecked
+        {
+            ulong z = stream += 0x9E3779B97F4A7C15UL;
+            z = (z ^ (z >> 30)) * 0xBF58476D1CE4E5B9UL;
+            z = (z ^ (z >> 27)) * 0x94D049BB133111EBUL;
+            z ^= z >> 31;
+            return ((float)(int)(z >> 41) + 0.5f) * 1.1920928955078125e-7f;
+        }
+    }
+""".strip("\n")
+_NORMAL = """
+    /// <summary>Draws from N(0, 1), by Box and Muller.</summary>
+    void Normal(float[] drawn)
+    {
+        for (int i = 0; i < drawn.Length; i++) {
+            double radius = global::System.Math.Sqrt(-2 * global::System.Math.Log(Uniform()));
+            drawn[i] = (float)(radius * global::System.Math.Cos(6.283185307179586 * Uniform()));
+        }
+    }
+""".strip("\n")
+
+
+def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
+    """The class. Raises UnsupportedOpError."""
+    return {f"{policy.name}.cs": Pieces(_text(plan_of(policy, options)).encode("ascii"))}
+
+
+def _text(plan: Plan) -> str:
+    header, program = plan.header, plan.program
+    name, state = header.class_name, header.state
+    words = CSharp()
+    printer = Printer(words, "w_", (name, *sorted({f.name for f in (*header.fed, *header.answered)})))
+    by_name = {f.spec.name: f for f in header.fed}
+    for key, tensor in program.inputs.items():
+        printer.called(tensor.place, by_name[key].name)
+    statements = printer.body(program, depth=2)
+    places = [
+        (printer.name(s.result.place), CS_TYPES[s.result.dtype.name], s.result.place.size) for s in program.stages
+    ]
+    fields = [(printer.name(p), CS_TYPES[p.dtype.name]) for p in printer.inputs(program)]
+    body = [f"        {kind}[] {n} = this.{n};" for n, kind in (*fields, *(p[:2] for p in places))]
+    body += statements
+    for f in header.answered:
+        target = state if f is header.next_state and state else f
+        source = printer.name(program.outputs[f.spec.name].place)
+        body.append(f"        global::System.Array.Copy({source}, this.{target.name}, {f.size});")
+    draws = printer.draws or bool(header.noise) or plan.chosen is not None
+    quiet = "".join(
+        f"        global::System.Array.Clear({f.name}, 0, {f.size});\n"
+        for f in (*header.noise, *((state,) if state else ()))
+    )
+    stream = "        stream = seed;\n" if draws else ""
+    members = [
+        "    // What the agent observes.\n" + "".join(map(_member, header.inputs)),
+        "    // What it keeps: the stream of its draws, noise, its state.\n"
+        + ("    ulong stream;\n" if draws else "")
+        + "".join(_member(f) for f in header.fed if f not in header.inputs),
+        "    // What it does.\n" + "".join(map(_member, header.outputs)),
+        "    // For computing.\n" + "".join(f"    readonly {k}[] {n} = new {k}[{size}];\n" for n, k, size in places),
+    ]
+    methods = [
+        "    /// <summary>A new agent, whose draws begin with a seed.</summary>\n"
+        f"    public {name}(ulong seed = 0) {{ Reset(seed); }}",
+        "    /// <summary>Begins an episode: no state, draws by a seed.</summary>\n"
+        f"    public void Reset(ulong seed = 0)\n    {{\n{stream}{quiet}    }}",
+        "    /// <summary>Decides: draws the noise where there is some, then computes.</summary>\n"
+        "    public void Act()\n    {\n"
+        + "".join(f"        Normal({f.name});\n" for f in header.noise)
+        + "        Compute();\n    }",
+        "    /// <summary>Computes with the noise that stands in its members (zeros: without chance).</summary>\n"
+        '    /// <exception cref="System.IndexOutOfRangeException">An observed index lies outside.</exception>\n'
+        "    public void Compute()\n    {\n" + "\n".join(body) + "\n    }",
+        *([_choose(plan.chosen, plan.sizes)] if plan.chosen else []),
+        _selftest(plan, words),
+        *([_UNIFORM] if draws else []),
+        *([_NORMAL] if header.noise else []),
+    ]
+    weights = [words.constant(place, printer.name(place)) for place in program.constants]
+    inner = [*(m.rstrip("\n") for m in members), *methods]
+    if words.helpers:
+        inner.append("\n".join(f"    {words.helpers[key]}" for key in sorted(words.helpers)))
+    inner += ["\n".join(f"    {line}" for line in w.splitlines()) for w in weights]
+    return (
+        f"/* {name}: a policy without a runtime, C# 7.3 for .NET Standard 2.0: every Unity since 2018, Godot .NET.\n"
+        f"   Made by export-model.\n\n{plan.contract}\n\nnamespace Policies\n{{\n\n"
+        f"/// <summary>One agent: what it observes, keeps and does are its members.</summary>\n"
+        f"public sealed class {name}\n{{\n" + "\n\n".join(inner) + "\n}\n\n}\n"
+    )
+
+
+def _member(field: Field) -> str:
+    shape = " x ".join(str(n) for n in (field.spec.shape[1:] if field.spec.batched else field.spec.shape))
+    kind = CS_TYPES[field.spec.dtype]
+    return (
+        f"    public readonly {kind}[] {field.name} = new {kind}[{field.size}]; "
+        f"// {field.spec.role.value}, {shape or '1'}\n"
+    )
+
+
+def _choose(field: Field, sizes: Sequence[int]) -> str:
+    """The method that draws classes by their log-probabilities, by the Gumbel trick."""
+    return (
+        f"    static readonly int[] branches = {{ {', '.join(map(str, sizes))} }};\n\n"
+        "    /// <summary>Draws a class for each branch.</summary>\n    public void Choose(int[] classes)\n    {\n"
+        "        int start = 0;\n        for (int branch = 0; branch < branches.Length; branch++) {\n"
+        "            double best = double.NegativeInfinity;\n            classes[branch] = 0;\n"
+        "            for (int i = 0; i < branches[branch]; i++) {\n"
+        "                double noise = global::System.Math.Log(-global::System.Math.Log(Uniform()));\n"
+        f"                double drawn = {field.name}[start + i] - noise;\n"
+        "                if (best < drawn) { best = drawn; classes[branch] = i; }\n            }\n"
+        "            start += branches[branch];\n        }\n    }"
+    )
+
+
+def _selftest(plan: Plan, words: CSharp) -> str:
+    """Golden rows: inputs by a formula, what the kernels make of them."""
+    head = (
+        "    /// <summary>How many numbers are not what the policy's own kernels computed: 0.</summary>\n"
+        "    public int SelfTest()\n    {\n"
+    )
+    if not plan.golden:
+        return f"{head}        return 0;\n    }}"
+    numbers = ", ".join(words.literal(x, np.dtype(np.float32)) for x in plan.golden)
+    fed = "".join(
+        f"            for (int i = 0; i < {f.size}; i++) {f.name}[i] = "
+        f"{_one(f, formula(f, '((i * 7 + row * 5) % 17 - 8) / 8f'))};\n"
+        for f in plan.header.inputs
+    )
+    checks = "".join(f"            wrong += Wrong({f.name}, golden, ref at);\n" for f in plan.checked)
+    return (
+        f"{head}        float[] golden = {{ {numbers} }}; // NaN: not compared\n        int wrong = 0, at = 0;\n"
+        f"        for (int row = 0; row < {ROWS}; row++) {{\n            Reset(0);\n{fed}"
+        f"            Compute();\n{checks}"
+        "        }\n        return wrong;\n    }\n\n"
+        "    static int Wrong(float[] answer, float[] golden, ref int at)\n    {\n        int wrong = 0;\n"
+        "        foreach (float x in answer) {\n            float y = golden[at++];\n"
+        f"            float most = {CLOSE}f * (1 + global::System.Math.Abs(y));\n"
+        "            if (!float.IsNaN(y) && !(global::System.Math.Abs(x - y) <= most)) wrong++;\n"
+        "        }\n        return wrong;\n    }"
+    )
+
+
+def _one(field: Field, text: str) -> str:
+    return {"1": "true", "0": "false"}[text] if field.spec.dtype == "bool" else text

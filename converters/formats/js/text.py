@@ -1,0 +1,118 @@
+"""The words of JavaScript for the loop language: numbers are rounded to float32 as C rounds them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from converters.graph.ops.loops.base import Applied, Element
+from converters.graph.printer import Language, bare, lines_of, numbers
+from converters.graph.program import Place, every
+from converters.graph.types import BOOL, FLOAT32, INT32, INT64
+
+#: The arrays of each dtype. int64 is held in doubles, which have every whole number up to 2 to the 53.
+JS_ARRAYS = {"float32": "Float32Array", "int32": "Int32Array", "int64": "Float64Array", "bool": "Uint8Array"}
+_SAME = ("exp", "expm1", "log", "log1p", "sqrt", "sin", "cos", "tan", "tanh", "floor", "ceil")
+_PLAIN = {"max": "Math.max", "min": "Math.min", "abs": "Math.abs"}
+#: Functions that a module brings along.
+_HELPERS = {
+    "mod": "function mod(a, b) { const r = a % b; return r !== 0 && r < 0 !== b < 0 ? r + b : r; }",
+    "intdiv": "function intdiv(a, b) { return Math.floor(a / b); }",
+    "rint": "function rint(a) { return Math.abs(a % 1) === 0.5 ? 2 * Math.round(a / 2) : Math.round(a); }",
+    "within": (
+        "function within(a, count) {\n    if (a >= 0 && a < count) return a;\n"
+        "    throw new RangeError(`the index ${a} lies outside of a table of ${count}`);\n}"
+    ),
+    "whole": (
+        "function whole(a, limit) {\n    return a >= -limit && a < limit ? Math.trunc(a) : -limit;\n}"
+    ),
+    "erf": (
+        "function erf(a) { // by its power series\n    if (!(Math.abs(a) < 4)) return a > 0 ? 1 : a < 0 ? -1 : a;\n"
+        "    let term = a, sum = a;\n    for (let n = 1; n < 70; n++) {\n        term *= -a * a / n;\n"
+        "        sum += term / (2 * n + 1);\n    }\n    return sum * 1.1283791670955126;\n}"
+    ),
+}  # fmt: skip
+
+
+class JavaScript(Language):
+    """An ES module."""
+
+    functions = (
+        {name: f"Math.{name}({{0}})" for name in _SAME}
+        | {name: f"{name}({{0}})" for name in ("erf", "rint")}
+        | {"pow": "Math.pow({0}, {1})"}
+    )
+
+    def literal(self, value: float, dtype: np.dtype) -> str:
+        """A number as JavaScript reads it, to the last bit."""
+        if dtype == BOOL:
+            return "true" if value else "false"
+        if dtype != FLOAT32:
+            return f"({int(value)})" if value < 0 else str(int(value))
+        if value != value:
+            return "NaN"
+        if value in (np.inf, -np.inf):
+            return "Infinity" if value > 0 else "(-Infinity)"
+        text = repr(float(np.float32(value))).removesuffix(".0")
+        return f"({text})" if text[0] == "-" else text
+
+    def declaration(self, dtype: np.dtype, name: str, value: str, *, constant: bool) -> str:
+        """A local variable."""
+        return f"{'const' if constant else 'let'} {name} = {value};"
+
+    def loop(self, name: str, first: int, last: int, step: int) -> str:
+        """The head of a loop."""
+        return f"for (let {name} = {first}; {name} < {last}; {name}{'++' if step == 1 else f' += {step}'}) {{"
+
+    def cast(self, text: str, source: np.dtype, target: np.dtype) -> str:
+        """A number of another dtype; a float outside of an integer's range is the least one."""
+        if source == target:
+            return text
+        if source == BOOL:
+            return f"(+{text})"
+        if target == FLOAT32:
+            return f"fround({bare(text)})"
+        if source == FLOAT32:
+            self.helpers["whole"] = _HELPERS["whole"]
+            return f"whole({bare(text)}, {2**31 if target == INT32 else 2**63})"
+        return f"({text} | 0)" if target == INT32 else text
+
+    def helper(self, function: str, operands: Sequence[str], dtype: np.dtype) -> str:
+        """A call of a function that the module brings along, or that ``Math`` has."""
+        if function not in _PLAIN:
+            self.helpers[function] = _HELPERS[function]
+        text = f"{_PLAIN.get(function, function)}({', '.join(bare(o) for o in operands)})"
+        return f"fround({text})" if function in ("mod", "intdiv") and dtype == FLOAT32 else text
+
+    def draw(self) -> str:
+        """The next number of an agent's stream."""
+        return "this.uniform()"
+
+    def rounded(self, text: str, x: Applied) -> str:
+        """A float32, by ``Math.fround``."""
+        return f"fround({bare(text)})" if x.dtype == FLOAT32 else text
+
+    def applied(self, x: Applied, operands: Sequence[str]) -> str:
+        """A function of operands; sums of int32 wrap as C's do, indices need not."""
+        for name in ("erf", "rint"):
+            if x.function == name:
+                self.helpers[name] = _HELPERS[name]
+        if x.function == "equal":
+            return f"({operands[0]} {'==' if x.operands[0].dtype == BOOL else '==='} {operands[1]})"
+        if x.dtype in (INT32, INT64) and x.function == "div":
+            return f"Math.trunc({operands[0]} / {operands[1]})"
+        if x.dtype == INT32 and any(isinstance(e, Element) for e in every(x)):
+            if x.function == "mul":
+                return f"Math.imul({operands[0]}, {operands[1]})"
+            if x.function in ("add", "sub"):
+                return f"({operands[0]} {'+' if x.function == 'add' else '-'} {operands[1]} | 0)"
+        return super().applied(x, operands)
+
+    def constant(self, place: Place, name: str) -> str:
+        """The definition of a constant."""
+        assert place.value is not None
+        value = place.value.reshape(-1)
+        plain = place.dtype == FLOAT32 and np.isfinite(value).all()
+        words = numbers(value, "{}") if plain else [self.literal(x, place.dtype) for x in value.tolist()]
+        return f"const {name} = new {JS_ARRAYS[place.dtype.name]}([\n    {lines_of(words)},\n]);"

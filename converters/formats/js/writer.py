@@ -1,0 +1,146 @@
+"""Policy to one ES module: every stage a loop nest, weights as typed arrays, nothing to import."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+
+import numpy as np
+
+from converters.files.chunks import Pieces
+from converters.formats.format import WriteOptions
+from converters.formats.js.text import JS_ARRAYS, JavaScript
+from converters.formats.programs.members import Field
+from converters.formats.programs.plan import CLOSE, ROWS, Plan, formula, plan_of
+from converters.graph.printer import Printer
+from converters.policy.policy import Policy
+
+_UNIFORM = """
+    /** The stream of draws, splitmix64: above 0, below 1. The same seed gives the same draws as in C and C#. */
+    uniform() {
+        this.stream = BigInt.asUintN(64, this.stream + 0x9E3779B97F4A7C15n);
+        let z = this.stream;
+        z = BigInt.asUintN(64, (z ^ (z >> 30n)) * 0xBF58476D1CE4E5B9n);
+        z = BigInt.asUintN(64, (z ^ (z >> 27n)) * 0x94D049BB133111EBn);
+        z ^= z >> 31n;
+        return (Number(z >> 41n) + 0.5) * 1.1920928955078125e-7;
+    }
+""".strip("\n")
+_NORMAL = """
+    /** Draws from N(0, 1), by Box and Muller. */
+    normal(out) {
+        for (let i = 0; i < out.length; i++) {
+            const radius = Math.sqrt(-2 * Math.log(this.uniform()));
+            out[i] = radius * Math.cos(6.283185307179586 * this.uniform());
+        }
+    }
+""".strip("\n")
+
+
+def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
+    """The module. Raises UnsupportedOpError."""
+    return {f"{policy.name}.mjs": Pieces(_text(policy.name, plan_of(policy, options)).encode("ascii"))}
+
+
+def _text(name: str, plan: Plan) -> str:
+    header, program = plan.header, plan.program
+    taken = ("fround", header.class_name, *sorted({f.name for f in (*header.fed, *header.answered)}))
+    words = JavaScript()
+    printer = Printer(words, "w_", taken)
+    by_name = {f.spec.name: f.name for f in header.fed}
+    for key, tensor in program.inputs.items():
+        printer.called(tensor.place, by_name[key])
+    statements = printer.body(program, depth=2)
+    places = [stage.result.place for stage in program.stages]
+    aliases = sorted({*(printer.name(p) for p in printer.inputs(program)), *map(printer.name, places)})
+    body = [f"        const {{ {', '.join(aliases)} }} = this;"] if aliases else []
+    body += statements
+    for f in header.answered:
+        target = header.state if f is header.next_state and header.state else f
+        source = printer.name(program.outputs[f.spec.name].place)
+        body.append(f"        this.{target.name}.set({source});")
+    draws = printer.draws or bool(header.noise) or plan.chosen is not None
+    quiet = [*header.noise, *([header.state] if header.state else [])]
+    drawn = "".join(f"        this.normal(this.{f.name});\n" for f in header.noise)
+    methods = [
+        "    /** A new agent, whose draws begin with a seed. */\n    constructor(seed = 0) {\n"
+        + "".join(_member(f) for f in (*header.fed, *header.outputs))
+        + "".join(f"        this.{printer.name(p)} = new {JS_ARRAYS[p.dtype.name]}({p.size});\n" for p in places)
+        + "        this.reset(seed);\n    }",
+        "    /** Begins an episode: no state, draws by a seed. */\n    reset(seed = 0) {\n"
+        + "        this.stream = BigInt.asUintN(64, BigInt(seed));\n"
+        + "".join(f"        this.{f.name}.fill(0);\n" for f in quiet)
+        + "    }",
+        "    /** Decides: draws the noise where there is some, then computes. */\n    act() {\n"
+        + f"{drawn}        this.compute();\n    }}",
+        "    /** Computes with the noise that stands in its members (zeros: without chance).\n"
+        "     *  Throws a RangeError where an observed index lies outside of its table. */\n    compute() {\n"
+        + "\n".join(body)
+        + "\n    }",
+        *([_choose(plan.chosen, plan.sizes)] if plan.chosen else []),
+        _selftest(plan, words),
+        *([_UNIFORM] if draws else []),
+        *([_NORMAL] if header.noise else []),
+    ]
+    ports = {
+        kind: {f.spec.name: [f.name, f.spec.dtype, list(f.spec.shape)] for f in some}
+        for kind, some in (("inputs", header.fed), ("outputs", header.outputs))
+    }
+    state = [header.state.name, header.next_state.spec.name] if header.state and header.next_state else None
+    parts = [
+        f"/* {header.class_name}: a policy without a runtime, for browsers, Node and others that have ES modules:\n"
+        f'       import {{ {header.class_name} }} from "./{name}.mjs";\n'
+        f"   Made by export-model.\n\n{plan.contract}",
+        "const { fround } = Math;",
+        *(words.constant(place, printer.name(place)) for place in program.constants),
+        *(words.helpers[key] for key in sorted(words.helpers)),
+        f"/** One agent: what it observes, keeps and does are its members, arrays that live as long as it. */\n"
+        f"export class {header.class_name} {{\n" + "\n\n".join(methods) + "\n}",
+        "/** Names of the contract: [member, dtype, shape]; the state's member, and the name of its next value. */\n"
+        f"export const ports = {json.dumps({**ports, 'state': state})};",
+        f"export default {header.class_name};",
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _member(field: Field) -> str:
+    shape = " x ".join(str(n) for n in (field.spec.shape[1:] if field.spec.batched else field.spec.shape))
+    about = f"{field.spec.role.value}, {shape or '1'}"
+    return f"        this.{field.name} = new {JS_ARRAYS[field.spec.dtype]}({field.size}); // {about}\n"
+
+
+def _choose(field: Field, sizes: Sequence[int]) -> str:
+    """The method that draws classes by their log-probabilities, by the Gumbel trick."""
+    return (
+        "    /** Draws a class for each branch. */\n    choose(action) {\n"
+        f"        let start = 0;\n        [{', '.join(map(str, sizes))}].forEach((size, branch) => {{\n"
+        "            let best = -Infinity;\n            action[branch] = 0;\n"
+        "            for (let i = 0; i < size; i++) {\n"
+        f"                const drawn = this.{field.name}[start + i] - Math.log(-Math.log(this.uniform()));\n"
+        "                if (best < drawn) { best = drawn; action[branch] = i; }\n            }\n"
+        "            start += size;\n        });\n        return action;\n    }"
+    )
+
+
+def _selftest(plan: Plan, words: JavaScript) -> str:
+    """Golden rows: inputs by a formula, what the kernels make of them."""
+    numbers = ", ".join(words.literal(x, np.dtype(np.float32)) for x in plan.golden)
+    head = (
+        "    /** How many numbers are not what the policy's own kernels computed at export: 0. */\n    selftest() {\n"
+    )
+    if not plan.golden:
+        return f"{head}        return 0;\n    }}"
+    fed = "".join(
+        f"            for (let i = 0; i < {f.size}; i++) this.{f.name}[i] = "
+        f"{formula(f, '((i * 7 + row * 5) % 17 - 8) / 8')};\n"
+        for f in plan.header.inputs
+    )
+    names = ", ".join(f"...this.{f.name}" for f in plan.checked)
+    return (
+        f"{head}        const golden = [{numbers}]; // NaN: not compared\n        let wrong = 0, at = 0;\n"
+        f"        for (let row = 0; row < {ROWS}; row++) {{\n            this.reset(0);\n{fed}"
+        f"            this.compute();\n            for (const x of [{names}]) {{\n"
+        "                const y = golden[at++];\n"
+        f"                if (y === y && !(Math.abs(x - y) <= {CLOSE} * (1 + Math.abs(y)))) wrong++;\n            }}\n"
+        "        }\n        return wrong;\n    }"
+    )

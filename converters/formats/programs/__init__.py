@@ -1,0 +1,1 @@
+"""What formats that are source code share: members' names, the contract in a comment, golden rows."""

@@ -1,0 +1,89 @@
+"""A policy as loops, with what every language says around them."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+
+from converters.compiler.targets import PROGRAM, prepare
+from converters.formats.format import WriteOptions
+from converters.formats.programs.members import Field, Header, header_of
+from converters.graph.ops.table import traits
+from converters.graph.program import Program, program_of
+from converters.graph.run import run_graph
+from converters.policy.policy import Policy
+from signatures.contract import EMBEDDED
+from signatures.errors import GraphError
+from signatures.records import dataclass
+from signatures.roles import Role
+
+#: Golden rows of the self test, and how far float32 may be off.
+ROWS = 3
+CLOSE = "1e-4"
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """The loops of a policy and its members.
+
+    ``contract`` is the text of a comment. ``chosen`` is the output that classes are drawn by, ``sizes`` its branches.
+    ``checked`` are the outputs that the self test compares, ``golden`` their numbers, row after row; NaN: any number.
+    """
+
+    header: Header
+    program: Program
+    contract: str
+    chosen: Field | None
+    sizes: tuple[int, ...]
+    checked: tuple[Field, ...]
+    golden: tuple[float, ...]
+
+
+def plan_of(policy: Policy, options: WriteOptions) -> Plan:
+    """Plan a policy's program. Raises UnsupportedOpError."""
+    header = header_of(policy.name, policy.signature)
+    fetches = {f.spec.name: policy.fetches[f.spec.name] for f in header.answered}
+    program = program_of(prepare(policy, PROGRAM), policy.feeds, fetches)
+    contract = "".join(c if c.isascii() else json.dumps(c)[1:-1] for c in options.contract)
+    contract = contract.replace("*/", "*\\/").replace("/*", "\\/*")
+    sizes = tuple(policy.signature.branches)
+    chosen = next((f for f in header.outputs if f.spec.role is Role.LOG_PROBS), None)
+    chosen = chosen if chosen is not None and sum(sizes) == chosen.size else None
+    checked, golden = _golden(policy, header)
+    return Plan(header, program, f"   {EMBEDDED}: {contract}\n*/", chosen, sizes, checked, golden)
+
+
+def formula(field: Field, floats: str) -> str:
+    """What the self test feeds to element ``i`` of a member in ``row``; ``floats`` is the language's formula."""
+    if field.spec.role is Role.MASKS:
+        return "1"
+    return floats if field.spec.dtype == "float32" else "0"
+
+
+def _fed(field: Field, row: int) -> np.ndarray:
+    i = np.arange(field.size)
+    if field.spec.role is Role.MASKS:
+        return np.ones(field.size)
+    return ((i * 7 + row * 5) % 17 - 8) / 8 if field.spec.dtype == "float32" else np.zeros(field.size)
+
+
+def _golden(policy: Policy, header: Header) -> tuple[tuple[Field, ...], tuple[float, ...]]:
+    """What the kernels make of inputs by a formula, as far as nothing is drawn."""
+    graph = policy.graph
+    drawn = graph.descendants(n.name for n in graph.nodes if traits(n).sampler)
+    checked = [f for f in header.outputs if f.spec.dtype == "float32"]
+    checked = [f for f in checked if policy.fetches[f.spec.name].partition(":")[0] not in drawn]
+    golden = list[float]()
+    for row in range(ROWS if checked else 0):
+        feeds = {}
+        for f in header.fed:
+            value = _fed(f, row) if f in header.inputs else np.zeros(f.size)
+            shape = [1 if n is None else n for n in f.spec.shape]
+            feeds[policy.feeds[f.spec.name]] = value.astype(f.spec.dtype).reshape(shape)
+        try:
+            found = run_graph(graph, feeds, [policy.fetches[f.spec.name] for f in checked])
+        except GraphError:  # zeros are no places in order
+            return (), ()
+        golden += [float(x) for f in checked for x in found[policy.fetches[f.spec.name]].reshape(-1)]
+    return tuple(checked), tuple(float(f"{x:.6g}") if np.isfinite(x) else np.nan for x in golden)

@@ -1,0 +1,35 @@
+"""C#: a class that Mono's compiler makes a program of, with all warnings as errors."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from functools import partial
+
+from converters.files.children.python import child_command
+from converters.runtimes.base import Runtime, RuntimeInfo
+
+_HOW = "sudo apt-get install mono-mcs mono-runtime" if os.name == "posix" else "mono on Linux or macOS"
+
+
+def tools() -> tuple[str, str] | None:
+    """The paths of Mono's compiler and of Mono."""
+    compiler, mono = shutil.which("mcs"), shutil.which("mono")
+    return None if compiler is None or mono is None else (compiler, mono)
+
+
+def _find() -> RuntimeInfo:
+    here = tools() is not None and os.name == "posix"
+    return RuntimeInfo("csharp", here, None, _HOW, supported=os.name == "posix")
+
+
+#: Its child gives up the network, and writing outside a folder, by itself: it starts the compiler and Mono.
+RUNTIMES = (
+    Runtime(
+        "csharp",
+        _find,
+        partial(child_command, "converters.runtimes.csharp.child"),
+        products_per_second=2e8,
+        confined=False,
+    ),
+)

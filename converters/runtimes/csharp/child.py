@@ -1,0 +1,183 @@
+"""C# in its own processes: ``python -m converters.runtimes.csharp.child``.
+
+This one compiles classes and starts a Mono for each; none of them writes outside of a folder of their own, or reaches
+a network. Memory and time of each are bounded.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from converters.files.children import confinement
+from converters.files.children.bounded import bound, run_bounded
+from converters.files.children.child import Model, claim_stdout, serve
+from converters.files.children.frames import Tensors
+from converters.formats.programs.artifact import held
+from converters.formats.programs.members import Field, Header, header_of
+from converters.runtimes.csharp import tools
+from converters.runtimes.rows import as_declared, fed_rows, row_count
+from signatures.contract import parse
+from signatures.errors import ExportModelError
+
+FLAGS = ("-langversion:7", "-warn:4", "-warnaserror", "-optimize+", "-nologo")
+#: What the compiler and a policy may take: bytes of memory, seconds of processor time, more for each byte of text.
+_BYTES, _SECONDS = 2 << 30, 60
+_BYTES_PER_BYTE, _SECONDS_PER_BYTE = 200, 4e-6
+_RUN_SECONDS = 3600
+
+
+class CompileError(Exception):
+    """The compiler's own words."""
+
+
+def driver(header: Header) -> str:
+    """Return a program that feeds a class row by row: what it reads and writes lies one after the other, in bytes."""
+
+    def copies(fields: Sequence[Field], into: bool) -> str:
+        lines, at = list[str](), 0
+        for f in fields:
+            size = f.size * np.dtype(f.spec.dtype).itemsize
+            member = f"agent.{(header.state if f is header.next_state and header.state else f).name}"
+            ends = f"input, row * {_bytes(fields)} + {at}, {member}, 0" if into else f"{member}, 0, output, {at}"
+            lines.append(f"System.Buffer.BlockCopy({ends}, {size});")
+            at += size
+        return " ".join(lines)
+
+    return f"""
+static class Driver
+{{
+    static int Main(string[] words)
+    {{
+        var agent = new Policies.{header.class_name}(ulong.Parse(words[0]));
+        int wrong = agent.SelfTest();
+        agent.Reset(ulong.Parse(words[0]));
+        var reader = new System.IO.BinaryReader(System.Console.OpenStandardInput());
+        var writer = new System.IO.BinaryWriter(System.Console.OpenStandardOutput());
+        writer.Write(wrong);
+        writer.Flush();
+        var output = new byte[{_bytes(header.answered)}];
+        while (true) {{
+            int rows;
+            try {{ rows = reader.ReadInt32(); }} catch (System.IO.EndOfStreamException) {{ return 0; }}
+            byte[] input = reader.ReadBytes(rows * {_bytes(header.fed)});
+            for (int row = 0; row < rows; row++) {{
+                {copies(header.fed, True)}
+                byte outside = 0;
+                try {{ agent.Compute(); }} catch (System.IndexOutOfRangeException) {{ outside = 1; }}
+                {copies(header.answered, False)}
+                writer.Write(outside);
+                writer.Write(output);
+            }}
+            writer.Flush();
+            System.GC.KeepAlive(input);
+        }}
+    }}
+}}
+"""
+
+
+def _bytes(fields: Sequence[Field]) -> int:
+    return sum(f.size * np.dtype(f.spec.dtype).itemsize for f in fields)
+
+
+class _Program:
+    def __init__(self, path: Path, seed: int, folder: Path, compiler: str, mono: str) -> None:
+        text = held(path)
+        if text is None:
+            raise ValueError(f"{path.name} has no contract")
+        self.header = header_of(path.stem, parse(json.loads(text)).signature)
+        own = Path(tempfile.mkdtemp(dir=folder))
+        shutil.copyfile(path, own / "policy.cs")
+        (own / "driver.cs").write_text(driver(self.header), "ascii")
+        size = path.stat().st_size
+        done = run_bounded(
+            [compiler, *FLAGS, "-out:policy.exe", "policy.cs", "driver.cs"],
+            own,
+            _BYTES + size * _BYTES_PER_BYTE,
+            _SECONDS + int(size * _SECONDS_PER_BYTE),
+        )
+        if done.returncode:
+            raise CompileError((done.stdout + done.stderr)[:2000])
+        self.process = subprocess.Popen(  # one thread, so nothing can hold a lock across the fork
+            [mono, str(own / "policy.exe"), str(seed)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            preexec_fn=lambda: bound(_BYTES + size * _BYTES_PER_BYTE, _RUN_SECONDS),
+        )
+        if wrong := int(np.frombuffer(self._read(4), "<i4")[0]):
+            raise ValueError(f"its self test finds {wrong} wrong numbers")
+
+    def _read(self, count: int) -> bytes:
+        assert self.process.stdout is not None
+        found = self.process.stdout.read(count)
+        if len(found) < count:
+            raise ValueError(f"Mono ended with status {self.process.wait()}")
+        return found
+
+    def run(self, feeds: Tensors, fetch: Sequence[str], request: Mapping[str, Any]) -> Tensors:
+        header, rows = self.header, row_count(self.header, feeds)
+        fed = [fed_rows(f, feeds.get(f.spec.name), rows) for f in header.fed]
+        parts = [a.view(np.uint8).reshape(rows, -1) for a in fed]
+        body = np.concatenate(parts, axis=1) if parts else np.zeros((rows, 0), np.uint8)
+        pipe = self.process.stdin
+        assert pipe is not None
+        kept = []
+        for row in body:  # one at a time: both pipes would fill up
+            pipe.write(np.array([1], "<i4").tobytes() + row.tobytes())
+            pipe.flush()
+            kept.append(self._read(1 + _bytes(header.answered)))
+        if without := sum(answer[0] for answer in kept):
+            raise ValueError(f"an index of {without} inputs lies outside of the table that it is looked up in")
+        made = np.frombuffer(b"".join(kept), np.uint8).reshape(rows, -1)[:, 1:]
+        found, at = {}, 0
+        for f in header.answered:
+            size = _bytes([f])
+            array = np.ascontiguousarray(made[:, at : at + size]).view(f.spec.dtype)
+            found[f.spec.name] = as_declared(f, array, rows)
+            at += size
+        return {name: found[name] for name in fetch}
+
+    def __del__(self) -> None:
+        process = getattr(self, "process", None)
+        if process is not None:
+            process.kill()
+            process.wait()
+
+
+def main() -> None:
+    """Entry of the child process."""
+    here = tools()
+    assert here is not None
+    folder = Path(tempfile.mkdtemp(prefix="export-model-csharp-"))
+    read, write = os.pipe()
+    if os.fork() == 0:  # it removes the folder when this one has ended, however it does
+        os.close(write)
+        os.read(read, 1)
+        shutil.rmtree(folder, ignore_errors=True)
+        os._exit(0)
+    os.close(read)
+    os.environ |= {"TMPDIR": str(folder), "HOME": str(folder), "MONO_DISABLE_SHARED_AREA": "1"}
+    confinement.confine(str(folder), starts=True)
+    out = claim_stdout()
+
+    def load(header: Mapping[str, Any]) -> Model:
+        seed = header.get("seed")
+        seed = int.from_bytes(os.urandom(8), "little") if seed is None else seed
+        return _Program(Path(header["path"]), seed, folder, *here)
+
+    serve("csharp", "mono", load, (CompileError, ExportModelError), out)
+
+
+if __name__ == "__main__":
+    main()
+    sys.exit()

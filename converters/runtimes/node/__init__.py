@@ -1,0 +1,21 @@
+"""Node: runs ES modules that were written without a runtime."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from converters.runtimes.base import Runtime, RuntimeInfo
+from converters.runtimes.javascript.node import INSTALL_NODE, node_command, node_executable
+
+_RUNNER = Path(__file__).resolve().with_name("runner.mjs")
+
+
+def _find() -> RuntimeInfo:
+    return RuntimeInfo("node", node_executable() is not None, None, INSTALL_NODE)
+
+
+def _command() -> list[str]:
+    return node_command(_RUNNER)
+
+
+RUNTIMES = (Runtime("node", _find, _command, products_per_second=2e8),)
