@@ -253,7 +253,7 @@ class Machine:
             if self.b.common_shape([shape, self.b.shape(after)]) != shape:
                 raise UnsupportedOpError(
                     f"{list(self.b.shape(after))} is written to a tensor of {list(shape)}",
-                    why="a buffer for other agents than the one that is computed here" if target.buffer else None,
+                    why="the code writes in place, and a tensor keeps its shape; here there is one agent",
                 )
             after = self.b.broadcast(after, shape)
         target.write(self.b.cast(after, self.b.dtype(before)))
