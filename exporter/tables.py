@@ -100,6 +100,6 @@ def size_with_original(kind: str, sizes: Mapping[str, int], whole: Mapping[str, 
     return f"{text} of {size_text(whole[kind])}" if kind in whole else text
 
 
-def counted(count: int, one: str, several: str | None = None) -> str:
+def count_text(count: int, one: str, several: str | None = None) -> str:
     """Return a number with its noun: ``1 source``, ``2 sources``."""
     return f"{count} {one if count == 1 else several or f'{one}s'}"

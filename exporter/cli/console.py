@@ -149,7 +149,7 @@ class Console:
         self._notes(report.notes)
         self._report(report)
 
-    def played(self, report: PlayReport) -> None:
+    def report_play(self, report: PlayReport) -> None:
         """One policy that played."""
         if self._silent or (self.quiet and report.passed is True):
             return

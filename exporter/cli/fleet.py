@@ -16,7 +16,7 @@ from exporter.cli.terminal import say_lines
 from exporter.fleet.fleet import export_fleet
 from exporter.fleet.sources import paths_text, sources_in
 from exporter.fleet.worker import Outcome, Wanted
-from exporter.tables import counted
+from exporter.tables import count_text
 from signatures.errors import UsageError
 
 if TYPE_CHECKING:
@@ -117,19 +117,22 @@ class _Tally:
     def failures(self) -> list[str]:
         """What went wrong, a text each; of very many the first, and how many more."""
         more = self.failed - _MOST_SHOWN
-        return [*self._told, *([f"… and {counted(more, 'more source')}; -v or --json shows all"] if more > 0 else [])]
+        return [
+            *self._told,
+            *([f"… and {count_text(more, 'more source')}; -v or --json shows all"] if more > 0 else []),
+        ]
 
     @property
     def summary(self) -> str:
         """All of it in a line."""
         seconds = time.monotonic() - self._start
-        parts = [f"{counted(self.policies, 'policy', 'policies')} exported ({self.verified} verified)"]
-        parts += [f"{counted(self.unchanged, 'source')} unchanged"] if self.unchanged else []
+        parts = [f"{count_text(self.policies, 'policy', 'policies')} exported ({self.verified} verified)"]
+        parts += [f"{count_text(self.unchanged, 'source')} unchanged"] if self.unchanged else []
         parts += [f"{self.disagree} DISAGREE"] if self.disagree else []
         parts += [f"{self.undecided} NOT DECIDED"] if self.undecided else []
-        parts += [f"{counted(self.refused, 'source')} REFUSED"] if self.refused else []
-        parts += [f"{counted(self.sources - self.done, 'source')} not reached"] if self.done < self.sources else []
-        done = f"{self.done} of {counted(self.sources, 'source')}"
+        parts += [f"{count_text(self.refused, 'source')} REFUSED"] if self.refused else []
+        parts += [f"{count_text(self.sources - self.done, 'source')} not reached"] if self.done < self.sources else []
+        done = f"{self.done} of {count_text(self.sources, 'source')}"
         return f"{done} in {seconds:.1f} s ({self.rate:.1f}/s): {', '.join(parts)}"
 
 

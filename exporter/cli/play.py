@@ -95,7 +95,7 @@ def play_command(
             progress=progress,
         )
     console.check_rules([report.replay])
-    console.played(report)
+    console.report_play(report)
     console.json(report.to_dict())
     if console.wants_reports:
         from exporter.play.documents import play_documents

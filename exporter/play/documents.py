@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from exporter import __version__
 from exporter.play import pictures
 from exporter.play.equivalence import CONFIDENCE, DIFFERENT, EQUIVALENT, NOT_DECIDED
-from exporter.play.report import PlayReport, figure, signed
+from exporter.play.report import PlayReport, figure, signed_text
 from exporter.reports import sections
 from exporter.reports.entry import Entry
 from exporter.reports.junit import count_cases, junit_file, suites_of
@@ -173,14 +173,14 @@ def _rows(report: PlayReport) -> list[Sequence[str]]:
     rows: list[Sequence[str]] = []
     for p in report.played:
         c = p.compared
-        interval = f"{signed(c.low)} to {signed(c.high)}"
+        interval = f"{signed_text(c.low)} to {signed_text(c.high)}"
         equal, rate = f"{c.equal} of {c.episodes}", f"{p.episodes.rate:,.0f}"
         rows.append(
             [
                 p.format,
                 p.runtime,
                 figure(p.episodes.returns.mean()),
-                signed(c.difference),
+                signed_text(c.difference),
                 interval,
                 equal,
                 rate,

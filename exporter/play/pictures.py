@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from exporter.play.equivalence import DIFFERENT, PERCENTILES
-from exporter.play.report import PlayReport, figure, signed
+from exporter.play.report import PlayReport, figure, signed_text
 from exporter.reports.charts import colour_of
 from exporter.reports.markup import Markup, el, svg
 
@@ -26,11 +26,14 @@ def intervals(report: PlayReport) -> Markup:
     parts = [el("line", class_="axis", x1=x(0), x2=x(0), y1=4, y2=bottom)]
     for bound in (-report.margin, report.margin):
         parts.append(el("line", class_="bound", x1=x(bound), x2=x(bound), y1=4, y2=bottom))
-        parts.append(_tick(signed(bound), x(bound), bottom + 14))
+        parts.append(_tick(signed_text(bound), x(bound), bottom + 14))
     for row, p in enumerate(played):
         c, y = p.compared, _ROW * row + 28
         bad = " bad" if c.verdict == DIFFERENT else ""
-        title = el("title", f"{p.where}: {signed(c.difference)}, from {signed(c.low)} to {signed(c.high)}, {c.verdict}")
+        title = el(
+            "title",
+            f"{p.where}: {signed_text(c.difference)}, from {signed_text(c.low)} to {signed_text(c.high)}, {c.verdict}",
+        )
         parts.append(el("text", p.where, class_="label", x=_LEFT, y=y - 10))
         parts.append(_bar(title, x(c.low), x(c.high), y, bad))
         parts.append(el("circle", class_="dot c0", cx=x(c.difference), cy=y, r=3))

@@ -97,10 +97,10 @@ class PlayReport:
         for p in self.played:
             c = p.compared
             word = replayed.get((p.format, p.runtime), "-")
-            interval = f"{signed(c.low)} to {signed(c.high)}"
+            interval = f"{signed_text(c.low)} to {signed_text(c.high)}"
             equal = f"{c.equal} of {c.episodes}"
             mean, rate = figure(p.episodes.returns.mean()), f"{p.episodes.rate:,.0f}"
-            rows.append([p.format, p.runtime, word, mean, signed(c.difference), interval, equal, rate, c.verdict])
+            rows.append([p.format, p.runtime, word, mean, signed_text(c.difference), interval, equal, rate, c.verdict])
         playing = {(p.format, p.runtime) for p in self.played}
         kept = {"weights", "source"}  # no artefacts: what rounding changed, and an original that died
         silent = [p for p in self.replay.pairs if (p.format, p.runtime) not in playing and p.format not in kept]
@@ -173,6 +173,6 @@ def figure(value: float | np.floating[Any]) -> str:
     return f"{float(value):.4g}"
 
 
-def signed(value: float) -> str:
+def signed_text(value: float) -> str:
     """Return a difference with its sign; 0 has none."""
     return "0" if value == 0 else f"{value:+.3g}"

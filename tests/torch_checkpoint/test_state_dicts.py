@@ -88,7 +88,7 @@ def trunk_of_ones_own(folder: Path) -> Path:
 @pytest.mark.parametrize("name", ["rsl_5_5", "own"])
 def test_the_activation_is_asked_for_where_no_script_tells_it(name: str, tmp_path: Path) -> None:
     path = trunk_of_ones_own(tmp_path) if name == "own" else saved(tmp_path, name)
-    with pytest.raises(SourceError, match="what stands between the layers") as caught:
+    with pytest.raises(SourceError, match="does not say which activation") as caught:
         read_source(path)
     assert f"--activation NAME ({'rsl_rl' if name == 'rsl_5_5' else 'CleanRL'}" in str(caught.value)
     exported = export_model(path, "-o", tmp_path / "out", "--activation", "elu", "--verify", "none")
@@ -124,7 +124,7 @@ def test_the_activation_that_isaac_lab_wrote_is_taken(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"contradicts params/agent\.yaml"):
         read_source(path, ReadOptions(activation="elu"))
     agent.write_text("actor:\n  activation: tanh\nstudent:\n  activation: relu\n")  # two: neither is taken
-    with pytest.raises(SourceError, match="what stands between the layers"):
+    with pytest.raises(SourceError, match="does not say which activation"):
         read_source(path)
 
 

@@ -64,7 +64,7 @@ def _statistics(given: Fetched, wanted: str | None) -> tuple[Path | None, tuple[
     if settings is None:
         return found, ()
     return None, (
-        f"{settings.name} says that it was trained behind VecNormalize, and there is no vecnormalize.pkl beside it: "
+        f"{settings.name} says that it was trained behind VecNormalize, and vecnormalize.pkl is missing beside it: "
         f"{_NORMALISED}, or give the file: --normaliser FILE",
     )
 

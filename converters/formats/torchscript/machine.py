@@ -217,7 +217,9 @@ class Machine:
             return self.b.const(np.array(self.number(value), dtype))
         if isinstance(value, float):
             return self.b.const(np.array(value, FLOAT32))
-        raise UnsupportedOpError(f"a {type(value).__name__} stands where a tensor is expected", why="it is no number")
+        raise UnsupportedOpError(
+            f"a {type(value).__name__} stands where a tensor is expected", why="it must be a number"
+        )
 
     def pair(self, left: Any, right: Any) -> tuple[str, str]:
         """Return two operands in one dtype, as PyTorch promotes them; an open length is told by the other's."""
@@ -241,7 +243,7 @@ class Machine:
     def constant_numbers(self, value: Any, meaning: str) -> np.ndarray:
         """Return the numbers of a tensor that is the same in every run: a weight. Raises UnsupportedOpError."""
         if not isinstance(value, Tensor):
-            raise UnsupportedOpError(f"{meaning} is no tensor", why="a weight is expected")
+            raise UnsupportedOpError(f"{meaning} must be a tensor", why="a weight is expected")
         return self.b.needed_constant(value.read(), meaning)
 
     def overwrite(self, target: Tensor, made: Tensor) -> None:

@@ -283,7 +283,7 @@ def _tensor_of(m: Machine, value: Any, dtype: Any = None, *rest: Any, **named: A
     """``torch.tensor`` of numbers."""
     array = np.array(value)
     if array.dtype.kind not in "biuf" or array.size > _MAX_PARTS:
-        raise UnsupportedOpError("a tensor is made of something that is no list of numbers", why="its code is damaged")
+        raise UnsupportedOpError("a tensor must be made of a list of numbers", why="its code is damaged")
     kind = {"f": FLOAT32, "b": array.dtype}.get(array.dtype.kind, INT64) if dtype is None else dtype_of(dtype)
     return Tensor(m.b.const(array.astype(kind)))
 
