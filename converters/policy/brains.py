@@ -145,14 +145,7 @@ def find_brains(
     if wanted:
         return _brains_from_user(graph, wanted, declared, told)
     fed = depends_on_input(graph)
-    given = {n: role for n, role in (declared or {}).items() if role is not None and n in fed}
-    says = {n: told[n].says if n in told and told[n].role is role else _KNOWN for n, role in given.items()}
-    if Role.ACTION not in given.values() and Role.Q_VALUES in given.values():  # an argmax beside the values
-        choices = [n for n in declared or () if n in fed and n not in given and _is_choice(graph, graph[n])]
-        if len(choices) == 1:
-            given[choices[0]], says[choices[0]] = Role.ACTION, _BEST
-    values = [n for n, role in given.items() if role is Role.Q_VALUES]
-    given |= dict.fromkeys(values[1:], Role.OTHER)
+    given, says = _declared_roles(graph, declared or {}, told, fed)
     if not {*given.values()}.isdisjoint(ACTING):
         outputs = tuple((n.rsplit("/", 1)[-1], role, n) for n, role in given.items())
         scope = _scope_of(graph, [n for n, role in given.items() if role in ACTING])
@@ -161,15 +154,35 @@ def find_brains(
         return (Brain(scope, (*outputs, *others), _constants(graph, scope), says=says | _reasons_declared(others)),)
     if declared:
         fed &= set(declared)
+    scopes = _scopes_with_action(graph, fed)
+    return tuple(_brain(graph, scope, fed) for scope in scopes) or (
+        _brain_of_sink(graph, fed, set(declared or ()), given, told),
+    )
+
+
+def _declared_roles(
+    graph: Graph, declared: Mapping[str, Role | None], told: Mapping[str, Decision], fed: set[str]
+) -> tuple[dict[str, Role], dict[str, str]]:
+    """Return the roles that the format knows of its outputs, and why; an argmax beside values is the action."""
+    given = {n: role for n, role in declared.items() if role is not None and n in fed}
+    says = {n: told[n].says if n in told and told[n].role is role else _KNOWN for n, role in given.items()}
+    if Role.ACTION not in given.values() and Role.Q_VALUES in given.values():
+        choices = [n for n in declared if n in fed and n not in given and _is_choice(graph, graph[n])]
+        if len(choices) == 1:
+            given[choices[0]], says[choices[0]] = Role.ACTION, _BEST
+    values = [n for n, role in given.items() if role is Role.Q_VALUES]
+    return given | dict.fromkeys(values[1:], Role.OTHER), says
+
+
+def _scopes_with_action(graph: Graph, fed: set[str]) -> list[str]:
+    """Return the outermost scopes that have a node called as an action is."""
     scopes: dict[str, int] = {}
     for node in graph.nodes:
         scope, _, base = node.name.rpartition("/")
         if base in ACTION_NAMES and node.name in fed and not is_fed(node):
             scopes[f"{scope}/" if scope else ""] = node.name.count("/")
-    if scopes:
-        depth = min(scopes.values())
-        return tuple(_brain(graph, scope, fed) for scope, d in scopes.items() if d == depth)
-    return (_brain_of_sink(graph, fed, set(declared or ()), given, told),)
+    depth = min(scopes.values(), default=0)
+    return [scope for scope, d in scopes.items() if d == depth]
 
 
 def explain_outputs(brain: Brain, told: Mapping[str, Decision]) -> tuple[Decision, ...]:
@@ -243,6 +256,45 @@ def _shows_one_of(graph: Graph, name: str, nodes: Collection[str]) -> bool:
 def _brains_from_user(
     graph: Graph, wanted: Mapping[str, Role], declared: Mapping[str, Role | None] | None, told: Mapping[str, Decision]
 ) -> tuple[Brain, ...]:
+    outputs = _outputs_from_user(graph, wanted)
+    nodes = {node_of(reference) for _, _, reference in outputs}
+    acted = {n for n, role in (declared or {}).items() if role is Role.ACTION} | {
+        n.name for n in graph.nodes if n.name.rpartition("/")[2] in ACTION_NAMES and not declared
+    }
+    given = {role for _, role, _ in outputs}
+    acted = {n for n in acted if not _shows_one_of(graph, n, nodes)}
+    if Role.ACTION in given or (Role.Q_VALUES in given and not acted):
+        scope = _scope_of(graph, [node_of(reference) for _, _, reference in outputs])
+        says = {reference: _TOLD for _, _, reference in outputs}
+        return (Brain(scope, tuple(outputs), _constants(graph, scope), says=says),)
+    # Naming one output is enough to say that the rest is where it always is.
+    named = {reference for _, _, reference in outputs}
+    rest = {n: role for n, role in (declared or {}).items() if n not in named}
+    return _give_outputs(find_brains(graph, declared=rest or declared, told=told), outputs)
+
+
+def _give_outputs(brains: tuple[Brain, ...], outputs: Sequence[tuple[str, Role, str]]) -> tuple[Brain, ...]:
+    """Return the brains with the user's outputs, each in the innermost scope around it, before their own."""
+    named = {reference for _, _, reference in outputs}
+    owners = [
+        max((b for b in brains if o[2].startswith(b.scope)), key=lambda b: len(b.scope), default=brains[0])
+        for o in outputs
+    ]
+    return tuple(
+        replace(
+            brain,
+            outputs=(
+                *(o for o, owner in zip(outputs, owners, strict=True) if owner is brain),
+                *(o for o in brain.outputs if o[2] not in named),
+            ),
+            says={**brain.says, **dict.fromkeys(named, _TOLD)},
+        )
+        for brain in brains
+    )
+
+
+def _outputs_from_user(graph: Graph, wanted: Mapping[str, Role]) -> list[tuple[str, Role, str]]:
+    """Return (name, role, reference) of each output of ``--output``. Raises UsageError."""
     outputs: list[tuple[str, Role, str]] = []
     for name, role in wanted.items():
         node_name, _ = split_ref(name)
@@ -263,35 +315,7 @@ def _brains_from_user(
             why="the action is the best of one of them",
             fix="give the role q_values to that one, and other to the rest",
         )
-    nodes = {node_of(reference) for _, _, reference in outputs}
-    acted = {n for n, role in (declared or {}).items() if role is Role.ACTION} | {
-        n.name for n in graph.nodes if n.name.rpartition("/")[2] in ACTION_NAMES and not declared
-    }
-    given = {role for _, role, _ in outputs}
-    acted = {n for n in acted if not _shows_one_of(graph, n, nodes)}
-    if Role.ACTION in given or (Role.Q_VALUES in given and not acted):
-        scope = _scope_of(graph, [node_of(reference) for _, _, reference in outputs])
-        says = {reference: _TOLD for _, _, reference in outputs}
-        return (Brain(scope, tuple(outputs), _constants(graph, scope), says=says),)
-    # Naming one output is enough to say that the rest is where it always is.
-    named = {reference for _, _, reference in outputs}
-    rest = {n: role for n, role in (declared or {}).items() if n not in named}
-    brains = find_brains(graph, declared=rest or declared, told=told)
-    owners = [
-        max((b for b in brains if o[2].startswith(b.scope)), key=lambda b: len(b.scope), default=brains[0])
-        for o in outputs
-    ]
-    return tuple(
-        replace(
-            brain,
-            outputs=(
-                *(o for o, owner in zip(outputs, owners, strict=True) if owner is brain),
-                *(o for o in brain.outputs if o[2] not in named),
-            ),
-            says={**brain.says, **dict.fromkeys(named, _TOLD)},
-        )
-        for brain in brains
-    )
+    return outputs
 
 
 def _scope_of(graph: Graph, names: Sequence[str]) -> str:
@@ -327,13 +351,7 @@ def _brain_of_sink(
     _check_acts(graph, sinks)
     chosen, why = _likely(graph, sinks, declared=bool(declared))
     if len(chosen) != 1:
-        shown = ", ".join(f"{n.name} ({n.op})" for n in sinks[:8]) + (" …" if len(sinks) > 8 else "")
-        several = f"; of each of {', '.join(n.name for n in chosen[:8])}: {why}" if chosen else ""
-        raise SignatureError(
-            "no policy found: cannot tell which output is the action",
-            why=f"no node is called 'action'; candidates are {shown}{several}",
-            fix="name them: --output NAME=action (and, if it has them, --output NAME=value_estimate …)",
-        )
+        raise _ambiguous_error(sinks, chosen, why)
     node = chosen[0]
     output = (node.name.rsplit("/", 1)[-1], Role.ACTION, node.name)
     outputs = (output, *((name.rsplit("/", 1)[-1], role, name) for name, role in known.items()))
@@ -343,6 +361,17 @@ def _brain_of_sink(
         others = _others(graph, outputs, rest, told)
         return Brain("", (*outputs, *others), _constants(graph, ""), says=says | _reasons_declared(others))
     return Brain("", outputs, _constants(graph, ""), tuple(rest), says)
+
+
+def _ambiguous_error(sinks: Sequence[Node], chosen: Sequence[Node], why: str) -> SignatureError:
+    """The error that several outputs, or none, may be the action; ``why`` is what speaks for each of ``chosen``."""
+    shown = ", ".join(f"{n.name} ({n.op})" for n in sinks[:8]) + (" …" if len(sinks) > 8 else "")
+    several = f"; of each of {', '.join(n.name for n in chosen[:8])}: {why}" if chosen else ""
+    return SignatureError(
+        "no policy found: cannot tell which output is the action",
+        why=f"no node is called 'action'; candidates are {shown}{several}",
+        fix="name them: --output NAME=action (and, if it has them, --output NAME=value_estimate …)",
+    )
 
 
 def _check_acts(graph: Graph, sinks: Sequence[Node]) -> None:
