@@ -221,7 +221,7 @@ def _play(
                 judging=judging,
                 progress=progress,
             )
-        console.played(report)
+        console.report_play(report)
         played.append(report)
     return played
 
