@@ -201,7 +201,7 @@ class Printer:
 
     def _assign(self, stage: Stage, body: Expression) -> None:
         words: dict[int, str] = {}
-        text = self._text(body, words, _shared(body))
+        text = self._text(body, words, _count_reads(body))
         self._say(f"{self._place(stage.result, stage.at, words, {})} = {bare(text)};")
 
     def _lanes(self, stage: Stage, body: Expression, summed: Reduced) -> None:
@@ -232,7 +232,7 @@ class Printer:
 
     def _block(self, stage: Stage, summed: Reduced, base: str, count: int) -> None:
         """So many elements of the last axis, from ``base`` on."""
-        counter, shared = stage.counters[-1], _shared(summed)
+        counter, shared = stage.counters[-1], _count_reads(summed)
         indices = [_plus(base, i) for i in range(count)]
         self._counters[id(counter)] = base
         names = [self._locals.fresh(f"{_KEPT[summed.kind]}{i}") for i in range(count)]
@@ -402,7 +402,7 @@ def _plus(index: str, count: int) -> str:
     return f"{index} + {count}" if count else index
 
 
-def _shared(x: Expression) -> dict[int, int]:
+def _count_reads(x: Expression) -> dict[int, int]:
     """How many times each part of an expression is read."""
     return Count(id(c) for one in every(x) for c in children(one))
 

@@ -40,7 +40,7 @@ from exporter.verify.participants import (
     Participant,
     PolicyUnderTest,
     Run,
-    loaded,
+    load_model,
     loading,
     policy_under_test,
     write_reference,
@@ -391,7 +391,7 @@ def _participants(
     chosen = [r for r in candidate.format.runtimes if r in runtimes and r != "numpy"]
     for runtime in chosen:
         again = loading(runtime, path, candidate.ports.options, partial(_run_renamed, candidate))
-        for model, run in loaded(again, pool, partial(_not_loaded, candidate, failure, runtime)):
+        for model, run in load_model(again, pool, partial(_not_loaded, candidate, failure, runtime)):
             blocked = any(p.blocking for p in candidate.problems)
             hints = {} if blocked else _same_numbers(candidate, policy, numpy_model, model)
             _misfits(candidate, failure, runtime, hints)

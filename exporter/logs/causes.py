@@ -67,7 +67,7 @@ class Cause:
     output: str | None = None
     answers: AnswerChange | None = None
 
-    def changed(self, inputs: Arrays) -> Arrays:
+    def change_inputs(self, inputs: Arrays) -> Arrays:
         """The inputs as the policy must have been given them."""
         return inputs if self.inputs is None else self.inputs(inputs)
 
@@ -164,12 +164,12 @@ def _normaliser(signature: PolicySignature, recording: Recording) -> Iterator[Ca
         mean, std = (np.broadcast_to(np.asarray(given[k], logged.dtype), logged.shape[1:]) for k in ("mean", "std"))
 
         twice = "the policy was given values that were normalised already: the normaliser was applied twice"
-        yield Cause("normaliser", spec.name, twice, on(spec.name, _normalised(mean, std)))
+        yield Cause("normaliser", spec.name, twice, on(spec.name, _normalise(mean, std)))
         missing = "the log has normalised values, or the normaliser was left out: the policy takes raw ones"
         yield Cause("normaliser", spec.name, missing, on(spec.name, _raw(mean, std)))
 
 
-def _normalised(mean: Array, std: Array) -> Callable[[Array], Array]:
+def _normalise(mean: Array, std: Array) -> Callable[[Array], Array]:
     return lambda array: ((array - mean) / std).clip(-NORMALISED_CLIP, NORMALISED_CLIP)
 
 

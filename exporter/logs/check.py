@@ -10,7 +10,7 @@ import numpy as np
 
 from exporter.logs.causes import Cause
 from exporter.logs.judging import LOG_TOLERANCE, Target, targets_of
-from exporter.logs.reading import read_recording, refused
+from exporter.logs.reading import log_error, read_recording
 from exporter.logs.recording import Array, Recording
 from exporter.logs.replay import Replay
 from exporter.logs.search import LEAST, explain
@@ -104,7 +104,7 @@ def check_log(policy: LoadedPolicy, path: Path, tolerance: Tolerance = LOG_TOLER
     targets = targets_of(signature, recording, draws_itself=policy.draws_itself)
     _check_drawable(path, policy, targets)
     pair = signature.recurrence
-    wanted = [n for t in targets for n in t.fetched] + ([pair[1]] if pair else [])
+    wanted = [n for t in targets for n in t.output_names] + ([pair[1]] if pair else [])
     replay = Replay(policy.run, signature, tuple(dict.fromkeys(wanted)))
     plain = Trials(replay, recording, targets, tolerance, drawn=False)
     base = plain.verdict()
@@ -128,7 +128,7 @@ def _check_drawable(path: Path, policy: LoadedPolicy, targets: list[Target]) -> 
     for target in targets:
         head = next((h for h in policy.signature.heads if h.name == target.name), None)
         if head is not None and policy.draws_itself and head.is_continuous and head.plain is None:
-            raise refused(
+            raise log_error(
                 path,
                 f"{target.name!r} cannot be computed again",
                 why="it is drawn inside the file, which gives neither its mean nor its spread",

@@ -52,7 +52,7 @@ class Target:
         return self.head and (self.scores is not None if self.branches else self.noisy or self.spread is not None)
 
     @property
-    def fetched(self) -> tuple[str, ...]:
+    def output_names(self) -> tuple[str, ...]:
         """The policy's outputs that it takes to judge it."""
         parts = [self.scores if self.branches and self.scores else self.answer, self.spread and self.spread[0]]
         return tuple(p for p in parts if p)

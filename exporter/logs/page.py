@@ -39,7 +39,7 @@ def log_page(report: LogReport) -> str:
     body = el(
         "body",
         el("header", el("p", "export-model · log", class_="eyebrow"), el("h1", title)),
-        el("main", el("article", verdict, _causes(report), charts, _said(report))),
+        el("main", el("article", verdict, _causes(report), charts, _words_section(report))),
         el("footer", f"Written by export-model {__version__}."),
     )
     return f"<!DOCTYPE html>\n{el('html', head, body, lang='en')}\n"
@@ -55,7 +55,7 @@ def _causes(report: LogReport) -> Markup | None:
     return section("What explains it", table("causes", ("where", "kind", "what"), lines))
 
 
-def _said(report: LogReport) -> Markup:
+def _words_section(report: LogReport) -> Markup:
     return section("In words", el("ul", [el("li", line.strip()) for line in report_lines(report)]))
 
 
@@ -74,7 +74,7 @@ def _chart(report: LogReport, name: str) -> Markup:
     if name in report.shares_explained:
         lines.append(("with the causes", report.shares_explained[name], "c1"))
     for title, shares, colour in lines:
-        points = " ".join(f"{_x(step, steps):.1f},{_y(share):.1f}" for step, share in _thinned(shares))
+        points = " ".join(f"{_x(step, steps):.1f},{_y(share):.1f}" for step, share in _worst_of_stretches(shares))
         parts.append(el("polyline", el("title", f"{name} {title}"), class_=f"line {colour}", points=points))
     said = f"{name}: share of what is allowed, per step; 1 is the bound"
     return el("figure", svg(parts, width=RIGHT + 8, height=BOTTOM + 26, aria_label=said), el("figcaption", said))
@@ -89,7 +89,7 @@ def _y(share: float) -> float:
     return BOTTOM - (BOTTOM - TOP) * (min(max(place, LOWEST), HIGHEST) - LOWEST) / (HIGHEST - LOWEST)
 
 
-def _thinned(shares: Array) -> list[tuple[int, float]]:
+def _worst_of_stretches(shares: Array) -> list[tuple[int, float]]:
     """(step, share): all of them, or the worst of each stretch."""
     width = max(1, -(-len(shares) // MOST_POINTS))
     found = []

@@ -47,18 +47,18 @@ def read_recording(path: Path, signature: PolicySignature) -> Recording:
     """The steps of a log. Raises UsageError, with the column's name, on what does not fit the policy."""
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
-        raise refused(path, "its name must end in .npz, .csv or .jsonl", fix="numpy.savez(FILE, **arrays), or CSV")
+        raise log_error(path, "its name must end in .npz, .csv or .jsonl", fix="numpy.savez(FILE, **arrays), or CSV")
     try:
         size = path.stat().st_size
     except OSError as error:
-        raise refused(path, "cannot be read", why=error.strerror or str(error)) from error
+        raise log_error(path, "cannot be read", why=error.strerror or str(error)) from error
     if size > MAX_LOG_BYTES:
-        raise refused(path, f"has {size} bytes", why=f"at most {MAX_LOG_BYTES} are read", fix="cut it into parts")
+        raise log_error(path, f"has {size} bytes", why=f"at most {MAX_LOG_BYTES} are read", fix="cut it into parts")
     arrays, rounding = reader(path)
     return _recording(path, arrays, rounding, signature)
 
 
-def refused(path: Path, what: str, *, why: str | None = None, fix: str | None = None) -> UsageError:
+def log_error(path: Path, what: str, *, why: str | None = None, fix: str | None = None) -> UsageError:
     """The error for a log that cannot be used."""
     return UsageError(f"--log: {what}", where=str(path), why=why, fix=fix)
 
@@ -78,19 +78,19 @@ def _recording(
             spec = specs.get(name.removesuffix(":0"))
             if spec is None:
                 known = ", ".join([*dict.fromkeys(s.name for s in specs.values()), AGENT, EPISODE, DONE, *IGNORED])
-                raise refused(path, f"{name!r} is not a column of this policy", fix=f"the columns are {known}")
+                raise log_error(path, f"{name!r} is not a column of this policy", fix=f"the columns are {known}")
             taken = inputs if spec in signature.inputs else outputs
             if spec.name in taken:
-                raise refused(path, f"{name!r} stands for {spec.name!r}, which is in the log already")
-            taken[spec.name] = _fitted(path, name, spec, array, signature)
+                raise log_error(path, f"{name!r} stands for {spec.name!r}, which is in the log already")
+            taken[spec.name] = _fit_to_spec(path, name, spec, array, signature)
             halves[spec.name] = rounding.get(name, np.zeros(1))
     steps = _count_steps(path, {**inputs, **outputs, **own})
     if not outputs:
         known = ", ".join(s.name for s in signature.outputs)
-        raise refused(path, "holds nothing that the policy answers", fix=f"log an action: one of {known}")
+        raise log_error(path, "holds nothing that the policy answers", fix=f"log an action: one of {known}")
     missing = [s.name for s in signature.inputs if s.role not in _DERIVED and s.name not in inputs]
     if missing:
-        raise refused(path, f"the input {missing[0]!r} is missing", fix="log every observation of every step")
+        raise log_error(path, f"the input {missing[0]!r} is missing", fix="log every observation of every step")
     agent = own.get(AGENT, np.zeros(steps, np.int64))
     episode = own.get(EPISODE, np.zeros(steps, np.int64))
     before, last = links(agent, np.zeros(steps, bool))
@@ -136,17 +136,19 @@ def _known_names(signature: PolicySignature) -> dict[str, TensorSpec]:
     return found | {s.name: s for s in both}
 
 
-def _fitted(path: Path, name: str, spec: TensorSpec, array: Array, signature: PolicySignature) -> Array:
+def _fit_to_spec(path: Path, name: str, spec: TensorSpec, array: Array, signature: PolicySignature) -> Array:
     """``array`` as the replay takes it; choices as int64 [steps, branches]."""
     if not array.size:
-        raise refused(path, f"holds no steps of {name!r}", fix="log at least one step")
+        raise log_error(path, f"holds no steps of {name!r}", fix="log at least one step")
     if array.dtype.kind not in "fiub":
-        raise refused(path, f"{name!r} must hold numbers", why=f"it is {array.dtype}")
+        raise log_error(path, f"{name!r} must hold numbers", why=f"it is {array.dtype}")
     if array.dtype.kind == "f":
         odd = np.argwhere(~np.isfinite(array.reshape(len(array), -1)))
         if len(odd):
             row, column = odd[0].tolist()
-            raise refused(path, f"{name}[{column}] is not a finite number at step {row}", fix="leave that episode out")
+            raise log_error(
+                path, f"{name}[{column}] is not a finite number at step {row}", fix="leave that episode out"
+            )
     choices = _choices(spec, array, signature)
     if choices is not None:
         return choices
@@ -155,7 +157,7 @@ def _fitted(path: Path, name: str, spec: TensorSpec, array: Array, signature: Po
     shape = (len(array), *(m if n is None else n for n, m in zip(wanted, free, strict=True)))
     if array.size != int(np.prod(shape)):
         text = ", ".join(["steps", *("any" if n is None else str(n) for n in wanted)])
-        raise refused(path, f"{name!r} has the shape {list(array.shape)}", why=f"the policy has [{text}]")
+        raise log_error(path, f"{name!r} has the shape {list(array.shape)}", why=f"the policy has [{text}]")
     array = array.reshape(shape)
     if spec not in signature.inputs:
         return array.astype(np.float64)
@@ -182,25 +184,25 @@ def _choices(spec: TensorSpec, array: Array, signature: PolicySignature) -> Arra
 
 def _numbers_of_steps(path: Path, name: str, array: Array) -> Array:
     if not array.size:
-        raise refused(path, f"holds no steps of {name!r}", fix="log at least one step")
+        raise log_error(path, f"holds no steps of {name!r}", fix="log at least one step")
     flat = array.reshape(len(array), -1)
     if flat.shape[1] != 1 or flat.dtype.kind not in "fiub" or not np.isfinite(flat).all():
-        raise refused(path, f"{name!r} must have one whole number for each step")
+        raise log_error(path, f"{name!r} must have one whole number for each step")
     if (flat != np.round(flat)).any():
-        raise refused(path, f"{name!r} must have one whole number for each step")
+        raise log_error(path, f"{name!r} must have one whole number for each step")
     return flat[:, 0].astype(np.int64)
 
 
 def _count_steps(path: Path, arrays: Mapping[str, Array]) -> int:
     counts = {name: len(array) for name, array in arrays.items()}
     if not counts or not max(counts.values()):
-        raise refused(path, "holds no steps", fix="log at least one step")
+        raise log_error(path, "holds no steps", fix="log at least one step")
     if len(set(counts.values())) > 1:
         said = ", ".join(f"{name} {count}" for name, count in counts.items())
-        raise refused(path, "its columns must have the same number of steps", why=said)
+        raise log_error(path, "its columns must have the same number of steps", why=said)
     steps = max(counts.values())
     if steps > MAX_STEPS:
-        raise refused(path, f"has {steps} steps", why=f"at most {MAX_STEPS} are read", fix="cut it into parts")
+        raise log_error(path, f"has {steps} steps", why=f"at most {MAX_STEPS} are read", fix="cut it into parts")
     return steps
 
 
@@ -222,27 +224,29 @@ def _read_csv(path: Path) -> tuple[dict[str, Array], dict[str, Array]]:
             head = [text.strip() for text in next(reader, [])]
             rows = [row for row in reader if row]
         except csv.Error as error:
-            raise refused(path, "cannot be read as CSV", why=str(error)) from error
+            raise log_error(path, "cannot be read as CSV", why=str(error)) from error
     if not head or not rows:
-        raise refused(path, "holds no steps", fix="a line of names, then a line for each step")
+        raise log_error(path, "holds no steps", fix="a line of names, then a line for each step")
     wrong = next((number for number, row in enumerate(rows, 2) if len(row) != len(head)), None)
     if wrong is not None:
-        raise refused(path, f"line {wrong} has {len(rows[wrong - 2])} fields", why=f"the first line names {len(head)}")
+        raise log_error(
+            path, f"line {wrong} has {len(rows[wrong - 2])} fields", why=f"the first line names {len(head)}"
+        )
     columns: dict[str, list[tuple[int, Array, float]]] = {}
     for place, text in enumerate(head):
         found = _COLUMN.fullmatch(text)
         if found is None:
-            raise refused(path, f"column {place + 1} has no name")
+            raise log_error(path, f"column {place + 1} has no name")
         number = found[2] or found[3]
         values = [row[place] for row in rows]
-        array = _parsed(path, text, values)
+        array = _parse_column(path, text, values)
         columns.setdefault(found[1], []).append((int(number or 0), array, _half_decimal(values)))
     arrays, halves = {}, {}
     for name, parts in columns.items():
         parts.sort(key=lambda part: part[0])
         if [part[0] for part in parts] != list(range(len(parts))):
             missing = next(i for i in range(len(parts) + 1) if i not in {p[0] for p in parts})
-            raise refused(path, f"{name}[{missing}] is missing", why=f"the columns {name}[…] must count from 0 on")
+            raise log_error(path, f"{name}[{missing}] is missing", why=f"the columns {name}[…] must count from 0 on")
         arrays[name] = np.stack([part[1] for part in parts], axis=1)
         halves[name] = np.asarray([part[2] for part in parts])
     return arrays, halves
@@ -255,7 +259,7 @@ def _text_of(path: Path) -> TextIO:
 _TRUTHS = {"true": "1", "false": "0"}
 
 
-def _parsed(path: Path, name: str, texts: Sequence[str]) -> Array:
+def _parse_column(path: Path, name: str, texts: Sequence[str]) -> Array:
     try:
         return np.asarray(texts, np.float64)
     except ValueError:
@@ -265,7 +269,7 @@ def _parsed(path: Path, name: str, texts: Sequence[str]) -> Array:
         try:
             float(_TRUTHS.get(plain, plain))
         except ValueError as error:
-            raise refused(path, f"{name!r} must hold numbers", why=f"line {number + 2} has {text[:40]!r}") from error
+            raise log_error(path, f"{name!r} must hold numbers", why=f"line {number + 2} has {text[:40]!r}") from error
     return np.asarray([float(_TRUTHS.get(t.strip().lower(), t)) for t in texts])
 
 
@@ -287,24 +291,24 @@ def _read_jsonl(path: Path) -> tuple[dict[str, Array], dict[str, Array]]:
         try:
             step = loads(line)
         except (ValueError, RecursionError) as error:
-            raise refused(path, f"line {number} is not JSON", why=str(error)) from error
+            raise log_error(path, f"line {number} is not JSON", why=str(error)) from error
         if not isinstance(step, Mapping):
-            raise refused(path, f'line {number} must be an object, such as {{"observation": […], "action": […]}}')
+            raise log_error(path, f'line {number} must be an object, such as {{"observation": […], "action": […]}}')
         if steps and step.keys() != steps[0].keys():
             odd = sorted(map(str, step.keys() ^ steps[0].keys()))[0]
             why = f"line {number} differs from the first"
-            raise refused(path, f"{odd!r} must be in every step or in none", why=why)
+            raise log_error(path, f"{odd!r} must be in every step or in none", why=why)
         steps.append(step)
     if not steps:
-        raise refused(path, "holds no steps", fix='an object on each line: {"observation": […], "action": […]}')
+        raise log_error(path, "holds no steps", fix='an object on each line: {"observation": […], "action": […]}')
     arrays = {}
     for name in steps[0]:
         try:
             array = np.asarray([step[name] for step in steps])
         except (ValueError, OverflowError) as error:
-            raise refused(path, f"{name!r} must have the same shape in every step", why=str(error)) from error
+            raise log_error(path, f"{name!r} must have the same shape in every step", why=str(error)) from error
         if array.dtype.kind not in "fiub":
-            raise refused(path, f"{name!r} must hold numbers", why=f"it is {array.dtype}")
+            raise log_error(path, f"{name!r} must hold numbers", why=f"it is {array.dtype}")
         arrays[str(name)] = array
     halves = {n: np.asarray([_half_of(a)]) for n, a in arrays.items() if a.dtype.kind == "f"}
     return arrays, halves

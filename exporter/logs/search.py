@@ -76,13 +76,13 @@ def _one_by_one(
     chain: tuple[Cause, ...] = ()
     current = start
     while len(chain) < MOST_CAUSES:
-        ranked = _ranked(few, many, table, chain, current)
+        ranked = _best_cause(few, many, table, chain, current)
         if not ranked:
             return None
         cause, current, others = ranked
         chain = (*chain, cause)
         if _explains(current, start) and _evidence(many, start, current) > least:
-            chain = _needed(many, chain, start)
+            chain = _drop_needless(many, chain, start)
             return chain, others if len(chain) == 1 else ()
     return None
 
@@ -106,13 +106,13 @@ def _several_columns(
         if not verdicts[order[0]].misfits.any():
             verdict = many.verdict(chain)
             if _explains(verdict, start) and _evidence(many, start, verdict) > least:
-                return _needed(many, chain, start), ()
+                return _drop_needless(many, chain, start), ()
         distinct = {frozenset((c.where, c.says) for c in tried[i]): tried[i] for i in order[: 4 * BEAMS]}
         beams = list(distinct.values())[:BEAMS]
     return None
 
 
-def _ranked(
+def _best_cause(
     few: Trials, many: Trials, table: Sequence[Cause], chain: Chain, current: Verdict
 ) -> tuple[Cause, Verdict, tuple[Cause, ...]] | None:
     """The next cause, what is found with it, and others that explain as much."""
@@ -194,7 +194,7 @@ def _evidence(many: Trials, start: Verdict, current: Verdict) -> float:
     return float(found)
 
 
-def _needed(many: Trials, chain: tuple[Cause, ...], start: Verdict) -> tuple[Cause, ...]:
+def _drop_needless(many: Trials, chain: tuple[Cause, ...], start: Verdict) -> tuple[Cause, ...]:
     """``chain`` without the causes that it does not take."""
     for cause in chain if len(chain) > 1 else ():
         rest = tuple(c for c in chain if c is not cause)

@@ -102,24 +102,24 @@ class Trials:
     def _some(self, chains: Sequence[Chain], *, sure: bool) -> Iterator[Verdict]:
         variants: list[Arrays] = []
         for chain in chains:
-            inputs = self._changed(self.recording.inputs, chain)
+            inputs = self._change_inputs(self.recording.inputs, chain)
             variants.append(inputs)
             if sure:
-                variants += [self._changed(self._moved(number), chain) for number in range(MOVES)]
+                variants += [self._change_inputs(self._move_inputs(number), chain) for number in range(MOVES)]
             variants += [{**inputs, **{n: np.full_like(inputs[n], step) for n in self._noise}} for step in self._noises]
         answers = self._answers(variants, _use(chains[0]))
         each = len(variants) // len(chains)
         for number, chain in enumerate(chains):
             found, *others = answers[number * each : (number + 1) * each]
             moved = others[:MOVES] if sure else []
-            yield self._judged(chain, found, moved, others[len(moved) :])
+            yield self._judge(chain, found, moved, others[len(moved) :])
 
-    def _changed(self, inputs: Arrays, chain: Chain) -> Arrays:
+    def _change_inputs(self, inputs: Arrays, chain: Chain) -> Arrays:
         for cause in chain:
-            inputs = cause.changed(inputs)
+            inputs = cause.change_inputs(inputs)
         return inputs
 
-    def _moved(self, number: int) -> Arrays:
+    def _move_inputs(self, number: int) -> Arrays:
         """The inputs, moved as far as text and float32 have rounded them."""
         rng = np.random.default_rng(number)
         found = dict(self.recording.inputs)
@@ -147,7 +147,7 @@ class Trials:
         found = self.replay.answers(stacked, links[0], links[1], use)
         return [{n: a[i * rows : (i + 1) * rows] for n, a in found.items()} for i in range(count)]
 
-    def _judged(
+    def _judge(
         self, chain: Chain, found: dict[str, Array], moved: Sequence[Arrays], noisy: Sequence[Arrays]
     ) -> Verdict:
         explained = {n: FACTOR * _largest_move(found[n], [m[n] for m in moved]) for n in found} if moved else {}
@@ -155,11 +155,11 @@ class Trials:
         draws: dict[str, Likelihood] = {}
         for target in self.targets:
             logged = self.recording.outputs[target.name]
-            own = self._answered(chain, target, found)
+            own = self._change_answers(chain, target, found)
             # A cause that reads another step's answer can say nothing of the first.
             blank = _blank_rows(own, target) if chain else np.zeros(len(logged), bool)
             if self.drawn and target.drawable:
-                other = [self._answered(chain, target, answers) for answers in noisy]
+                other = [self._change_answers(chain, target, answers) for answers in noisy]
                 odds = likelihood(target, logged, own, other, self._clips.get(target.name))
                 draws[target.name] = odds.without(blank)
                 by_target[target.name] = np.zeros((len(logged), 1))
@@ -170,9 +170,9 @@ class Trials:
             by_target[target.name] = np.where(blank[:, None], 0.0, share)
         return Verdict(by_target, draws, found)
 
-    def _answered(self, chain: Chain, target: Target, found: Arrays) -> Arrays:
+    def _change_answers(self, chain: Chain, target: Target, found: Arrays) -> Arrays:
         """The answers that ``target`` is judged by, as the causes of ``chain`` change them."""
-        names = [n for n in dict.fromkeys([*target.fetched, target.answer]) if n in found]
+        names = [n for n in dict.fromkeys([*target.output_names, target.answer]) if n in found]
         for cause in chain:
             if cause.answers is not None and cause.output == target.name:
                 changed = {n: cause.answers(_rows(found[n]).astype(np.float64), self.recording) for n in names}
@@ -211,7 +211,7 @@ def _use(chain: Chain) -> MemoryUse:
 
 
 def _blank_rows(answers: Arrays, target: Target) -> Array:
-    numbers: Array = _rows(answers[target.fetched[0]]).astype(np.float64)
+    numbers: Array = _rows(answers[target.output_names[0]]).astype(np.float64)
     return np.asarray(np.isnan(numbers).all(axis=1))
 
 

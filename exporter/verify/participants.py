@@ -175,11 +175,11 @@ def participants_of(
         for key, names in loads.items():
             label = kind if key in ("", "serving_default") else f"{kind}:{key}"
             limit = tested.signatures.get(key)
-            running = partial(_predicting, names) if WRITTEN[kind].predicts else partial(_limited, limit)
+            running = partial(_predicting, names) if WRITTEN[kind].predicts else partial(_limit_inputs, limit)
             if tested.batch is not None and WRITTEN[kind].fixed:
                 running = partial(_in_batches, running, tested.batch, tested.signature)
             again = loading(runtime, path, WRITTEN[kind].loader(key), running)
-            for model, run in loaded(again, pool, partial(failure, label, runtime)):
+            for model, run in load_model(again, pool, partial(failure, label, runtime)):
                 yield Participant(
                     format=label,
                     runtime=runtime,
@@ -215,7 +215,7 @@ def loading(runtime: str, path: Path, options: Mapping[str, Any], running: Calla
     return load
 
 
-def loaded(
+def load_model(
     load: Loading, pool: RuntimePool, failure: Callable[[RunFailedError, str], None]
 ) -> Iterator[tuple[LoadedModel, Run]]:
     """Yield the one model that ``load`` gives, and unload it then; nothing, but a ``failure``, where it gives none."""
@@ -228,7 +228,7 @@ def loaded(
     model.unload()
 
 
-def _limited(signature: tuple[Sequence[str], Sequence[str]] | None, model: LoadedModel) -> Run:
+def _limit_inputs(signature: tuple[Sequence[str], Sequence[str]] | None, model: LoadedModel) -> Run:
     if signature is None:
         return model.run_all
     names = frozenset(signature[0])

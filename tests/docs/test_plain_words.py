@@ -23,8 +23,8 @@ IRREGULAR = re.compile(
 #: What is a participle and a verb, or only ends like one.
 VERBS = re.compile("cut|embed|exceed|feed|led|need|proceed|read|reseed|seed|set|speed|split|succeed")
 #: Functions named by a lone participle. What is left are answers of yes or no that users know from JSON (``passed``,
-#: ``accepted``, ``proven``), and rooms that others were at work in when the rest was renamed (C, LiteRT).
-PARTICIPLES = 54
+#: ``accepted``, ``proven``), and methods of the writers of LiteRT and of source code.
+PARTICIPLES = 36
 #: Strings with "is no".
 IS_NO = 0
 

@@ -14,7 +14,7 @@ from converters.formats.format import Port, Ports
 from converters.formats.intermediate_tensors import Feeds, InnerTensors, Loaded, View
 from converters.formats.litert.flatbuffer import Table, decode, encode
 from converters.formats.litert.schema import BUILTINS, OPERATOR_NAMES
-from converters.formats.litert.tensors import dims_of, dtype_of, entry_of, needed
+from converters.formats.litert.tensors import dims_of, dtype_of, entry_of, needed_operators
 from converters.formats.onnx.tensor_map import TENSORS_KEY, loads
 from signatures.contract import EMBEDDED
 from signatures.errors import UnsupportedOpError
@@ -90,7 +90,7 @@ def function_alone(path: Path, function: int, ports: Collection[int]) -> bytes:
     """A copy with one function, that makes nothing but some tensors. Raises SourceError, DamagedFileError."""
     model = decode(read_bytes(path))
     subgraph = entry_of(model, "subgraphs", function)
-    operators = needed(subgraph, ports, (int(i) for i in subgraph.get("inputs", ())))
+    operators = needed_operators(subgraph, ports, (int(i) for i in subgraph.get("inputs", ())))
     kept = {"version", "operator_codes", "buffers"}
     alone = {**subgraph, "operators": operators, "outputs": [*ports]}
     return encode({**{k: v for k, v in model.items() if k in kept}, "subgraphs": [alone]}).to_bytes()
@@ -105,7 +105,7 @@ def inner(loaded: Loaded) -> Iterator[InnerTensors]:
     subgraph = model["subgraphs"][signature.get("subgraph_index", 0)]
     tensors = subgraph["tensors"]
     numbers = {t["name"]: i for i, t in enumerate(tensors) if t.get("name")}
-    kept = _kept(model, subgraph)
+    kept = _narrow_weights(model, subgraph)
     made = {int(i) for operator in subgraph["operators"] for i in operator["outputs"]} - kept.keys()
     fed = {entry["name"]: entry.get("tensor_index", 0) for entry in signature["inputs"]}
 
@@ -140,7 +140,7 @@ def inner(loaded: Loaded) -> Iterator[InnerTensors]:
         yield InnerTensors(view, run)
 
 
-def _kept(model: Table, subgraph: Table) -> dict[int, int]:
+def _narrow_weights(model: Table, subgraph: Table) -> dict[int, int]:
     """Weights that the file keeps in fewer bytes: the tensor that is widened → the one that is kept.
 
     XNNPACK does so before it runs anything, and does not say what came of it.

@@ -90,7 +90,7 @@ class _Writer:
                 struct.pack_into("<I", piece.data, where, other.at - piece.at - where)
             parts += [bytes(piece.at - end) + bytes(piece.data), piece.content]
             end = piece.at + piece.size
-        return Pieces(*_joined(parts))
+        return Pieces(*_join_bytes(parts))
 
     def _table(self, name: str, values: Mapping[str, Any]) -> _Piece:
         """Its fields by falling size behind the offset of the vtable, so that each is aligned."""
@@ -153,7 +153,7 @@ def _width(field: Field) -> int:
     return struct.calcsize(_SCALARS.get(field.kind, "I"))
 
 
-def _joined(parts: Sequence[bytes | np.ndarray]) -> list[bytes | np.ndarray]:
+def _join_bytes(parts: Sequence[bytes | np.ndarray]) -> list[bytes | np.ndarray]:
     """Neighbours that are bytes as one."""
     found: list[bytes | np.ndarray] = []
     small: list[bytes] = []

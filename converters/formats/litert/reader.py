@@ -17,7 +17,7 @@ from converters.formats.litert.flatbuffer import Table, decode
 from converters.formats.litert.importer.importer import Importer
 from converters.formats.litert.importer.table import TABLE
 from converters.formats.litert.schema import VERSION
-from converters.formats.litert.tensors import Tensors, damaged, entry_of, needed
+from converters.formats.litert.tensors import Tensors, damaged_error, entry_of, needed_operators
 from converters.formats.onnx.tensor_map import TENSORS_KEY, loads
 from converters.formats.saved_model.signature import ModelSignature, Tensor
 from converters.graph.builder import MAX_NODES
@@ -78,7 +78,7 @@ def read_litert(data: bytes) -> LitertModel:
         outputs |= {n: _wide(model, subgraph, tensors, outputs[n]) for n in outputs.keys() & wide}
     if not outputs:
         raise NotAPolicyError("the model gives nothing", fix="give the model that training exported")
-    operators = needed(subgraph, outputs.values(), inputs.values())
+    operators = needed_operators(subgraph, outputs.values(), inputs.values())
     if len(operators) > MAX_NODES:
         raise NotAPolicyError(
             f"the model has {len(operators)} operators",
@@ -138,6 +138,6 @@ def _ports(subgraph: Table, called: Table, side: str, tensors: Tensors) -> dict[
         own = tensors.name(number).removeprefix(_SERVED)
         name = name or own.removesuffix(":0")
         if name in found:
-            raise damaged(f"two {side} are called {name!r}")
+            raise damaged_error(f"two {side} are called {name!r}")
         found[name] = number
     return found

@@ -108,7 +108,7 @@ class Subgraph:
         entry = {"opcode_index": self._version(op, inputs, options), "inputs": list(inputs), "outputs": list(values)}
         told = BUILTINS[op].options
         if told:
-            entry |= {"builtin_options_type": OPTIONS[told], "builtin_options": _encoded(options)}
+            entry |= {"builtin_options_type": OPTIONS[told], "builtin_options": _encode_options(options)}
         self.operators.append({k: v for k, v in entry.items() if v != 0})
         self._made.update(dict.fromkeys(values, self.operators[-1]))
         return values
@@ -237,7 +237,7 @@ class Subgraph:
         return copied
 
 
-def _encoded(options: dict[str, Any]) -> Table:
+def _encode_options(options: dict[str, Any]) -> Table:
     found: Table = {}
     for name, value in options.items():
         if isinstance(value, np.dtype):

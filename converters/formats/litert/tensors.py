@@ -25,7 +25,7 @@ UNNAMED = re.compile(r"tensor_\d+")
 _REPEATED, _FREE = 4, 1 << 20
 
 
-def damaged(why: str) -> DamagedFileError:
+def damaged_error(why: str) -> DamagedFileError:
     """The error of a file that does not hold together."""
     return DamagedFileError("the .tflite file is damaged", why=why, fix="fetch or convert it again")
 
@@ -34,7 +34,7 @@ def entry_of(table: Table, vector: str, number: int) -> Table:
     """An entry of a vector. Raises DamagedFileError."""
     entries = table.get(vector, ())
     if not 0 <= number < len(entries):
-        raise damaged(f"it has no {vector}[{number}]")
+        raise damaged_error(f"it has no {vector}[{number}]")
     found: Table = entries[number]
     return found
 
@@ -50,7 +50,7 @@ def dims_of(tensor: Table) -> tuple[int | None, ...]:
     return tuple(None if n < 0 else int(n) for n in shape)
 
 
-def needed(subgraph: Table, outputs: Iterable[int], inputs: Iterable[int]) -> list[Table]:
+def needed_operators(subgraph: Table, outputs: Iterable[int], inputs: Iterable[int]) -> list[Table]:
     """The operators that make the outputs of inputs, in the file's order."""
     fed, found = frozenset(inputs), list[Table]()
     wanted = set(outputs) - fed
@@ -99,7 +99,7 @@ class Tensors:
         tensor = self._table(number)
         found = dims_of(tensor)
         if len(found) > _MAX_AXES:
-            raise damaged(f"tensor {number} has {len(found)} axes")
+            raise damaged_error(f"tensor {number} has {len(found)} axes")
         return found
 
     def check_plain(self, number: int, kind: str) -> None:
@@ -110,17 +110,17 @@ class Tensors:
         if "scale" in tensor.get("quantization", {}) and len(tensor["quantization"]["scale"]):
             dtype = dtype_of(tensor)
             if dtype is not None and dtype.kind in "iu":
-                raise _refused(
+                raise _unsupported_error(
                     f"the tensor {self.name(number)!r}, with which {kind} computes, is quantised to {dtype}",
                     "of a model that computes in integers runtimes give different results",
                     "give the float32 model that it was made of (weights alone in float16 or int8 are read)",
                 )
         if "sparsity" in tensor:
-            raise _refused(
+            raise _unsupported_error(
                 f"the tensor {self.name(number)!r} is kept in a sparse form", None, "convert the model without it"
             )
         if tensor.get("is_variable"):
-            raise _refused(
+            raise _unsupported_error(
                 f"the tensor {self.name(number)!r} keeps its value from one call to the next",
                 "the memory of a policy is an input and an output",
                 "give the model it was converted from, or convert one whose memory is an input and an output",
@@ -135,10 +135,10 @@ class Tensors:
         if data is None or len(data) == 0:
             return np.zeros(shape, dtype) if dtype is not None and 0 in shape and min(shape) == 0 else None
         if dtype is None or len(shape) > _MAX_AXES or min(shape, default=0) < 0:
-            raise damaged(f"the constant {self.name(number)!r} has no numbers, or lengths below 0")
+            raise damaged_error(f"the constant {self.name(number)!r} has no numbers, or lengths below 0")
         if math.prod(shape) * dtype.itemsize != len(data):
             said = f"has {len(data)} bytes, which are not of the shape {list(shape)[:8]}"
-            raise damaged(f"the constant {self.name(number)!r} {said}")
+            raise damaged_error(f"the constant {self.name(number)!r} {said}")
         key = (buffer, dtype.num, shape)
         if key not in self._known:
             self._count(len(data))
@@ -160,9 +160,11 @@ class Tensors:
         zero = zero if zero.size else np.zeros(1)
         several = scale.size > 1
         if value.dtype.kind not in "iu" or not scale.size or zero.size not in (1, scale.size):
-            raise damaged(f"the constant {self.name(number)!r} does not say which floats it stands for")
+            raise damaged_error(f"the constant {self.name(number)!r} does not say which floats it stands for")
         if several and (not 0 <= axis < value.ndim or value.shape[axis] != scale.size):
-            raise damaged(f"the constant {self.name(number)!r} has {scale.size} scales for another number of channels")
+            raise damaged_error(
+                f"the constant {self.name(number)!r} has {scale.size} scales for another number of channels"
+            )
         sizes = [-1 if several and i == axis else 1 for i in range(value.ndim)]
         steps, zeros = scale.astype(FLOAT32).reshape(sizes), np.broadcast_to(zero, scale.shape).reshape(sizes)
         return np.asarray((value.astype(np.int64) - zeros.astype(np.int64)).astype(FLOAT32) * steps, FLOAT32)
@@ -170,8 +172,8 @@ class Tensors:
     def _count(self, size: int) -> None:
         self._left -= size
         if self._left < 0:
-            raise damaged(f"its constants name the same bytes more than {_REPEATED} times over")
+            raise damaged_error(f"its constants name the same bytes more than {_REPEATED} times over")
 
 
-def _refused(what: str, why: str | None, fix: str) -> UnsupportedOpError:
+def _unsupported_error(what: str, why: str | None, fix: str) -> UnsupportedOpError:
     return UnsupportedOpError(what, why=why, fix=fix)

@@ -61,7 +61,7 @@ def formula(field: Field, floats: str) -> str:
     return floats if field.spec.dtype == "float32" else "0"
 
 
-def _fed(field: Field, row: int) -> np.ndarray:
+def _sample_values(field: Field, row: int) -> np.ndarray:
     i = np.arange(field.size)
     if field.spec.role is Role.MASKS:
         return np.ones(field.size)
@@ -78,7 +78,7 @@ def _golden(policy: Policy, header: Header) -> tuple[tuple[Field, ...], tuple[fl
     for row in range(ROWS if checked else 0):
         feeds = {}
         for f in header.fed:
-            value = _fed(f, row) if f in header.inputs else np.zeros(f.size)
+            value = _sample_values(f, row) if f in header.inputs else np.zeros(f.size)
             shape = [1 if n is None else n for n in f.spec.shape]
             feeds[policy.feeds[f.spec.name]] = value.astype(f.spec.dtype).reshape(shape)
         try:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from converters.formats.litert.importer.elementwise import activated
+from converters.formats.litert.importer.elementwise import add_activation
 from converters.formats.litert.importer.importer import Importer
 from converters.formats.litert.importer.operator import Op, Translate
 from converters.graph.nn import choosing as nn
@@ -42,7 +42,7 @@ def _squeeze(op: Op, net: Importer) -> str:
 def _axis(op: Op, net: Importer, position: int) -> int:
     value = net.needed_constant(op.need(position), "its axis").reshape(-1)
     if value.size != 1:
-        raise op.refused(f"it has {value.size} axes in place of one")
+        raise op.refusal(f"it has {value.size} axes in place of one")
     return int(value[0])
 
 
@@ -53,7 +53,7 @@ def _expand_dims(op: Op, net: Importer) -> str:
 def _concat(op: Op, net: Importer) -> str:
     parts, axis = op.operands(), op.integer("axis")
     value = net.add("ConcatV2", [*parts, net.ints(axis, "axis")]) if len(parts) > 1 else parts[0]
-    return activated(op, net, value)
+    return add_activation(op, net, value)
 
 
 def _pack(op: Op, net: Importer) -> str:
@@ -97,7 +97,7 @@ def _strided_slice(op: Op, net: Importer) -> str:
 
 def _gather(op: Op, net: Importer) -> str:
     if op.integer("batch_dims"):
-        raise op.refused("it looks up rows of each row (batch_dims)")
+        raise op.refusal("it looks up rows of each row (batch_dims)")
     return net.add("GatherV2", [op.need(0), op.need(1), net.ints(op.integer("axis"), "axis")])
 
 
@@ -105,7 +105,7 @@ def _gather_nd(op: Op, net: Importer) -> str:
     """Of one index each, as rows are looked up."""
     x, indices = op.need(0), op.need(1)
     if net.length(indices, -1) != 1:
-        raise op.refused("an index of it has several numbers")
+        raise op.refusal("an index of it has several numbers")
     return net.add("GatherV2", [x, net.squeeze(indices, [net.rank(indices) - 1]), net.ints(0, "axis")])
 
 
@@ -159,13 +159,13 @@ def _top_k(op: Op, net: Importer) -> list[str]:
     return [best, net.cast(place, op.dtypes[1])]
 
 
-def _cumulated(op: Op, net: Importer) -> str:
+def _cumulative_sum(op: Op, net: Importer) -> str:
     axis = net.axis(op.need(0), _axis(op, net, 1))
     x = nn.last(net, op.need(0), axis)
     return nn.moved_back(net, nn.cumulate(net, x, exclusive=op.flag("exclusive"), reverse=op.flag("reverse")), axis)
 
 
-def _drawn(kind: str) -> Translate:
+def _sampler(kind: str) -> Translate:
     return lambda op, net: net.add(kind, [op.need(0)], dtype=op.dtypes[0])
 
 
@@ -179,15 +179,15 @@ OPS: Mapping[str, Translate] = {
     "ARG_MIN": _arg("ArgMin"),
     "BROADCAST_TO": _broadcast,
     "CONCATENATION": _concat,
-    "CUMSUM": _cumulated,
+    "CUMSUM": _cumulative_sum,
     "EXPAND_DIMS": _expand_dims,
     "GATHER": _gather,
     "GATHER_ND": _gather_nd,
     "MULTINOMIAL": _multinomial,
     "ONE_HOT": _one_hot,
     "PACK": _pack,
-    "RANDOM_STANDARD_NORMAL": _drawn("RandomStandardNormal"),
-    "RANDOM_UNIFORM": _drawn("RandomUniform"),
+    "RANDOM_STANDARD_NORMAL": _sampler("RandomStandardNormal"),
+    "RANDOM_UNIFORM": _sampler("RandomUniform"),
     "RANGE": _range,
     "RANK": _rank,
     "RESHAPE": _reshape,

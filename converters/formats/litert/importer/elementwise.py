@@ -41,13 +41,13 @@ _APPLIED: Mapping[str, Callable[[Builder, str], str]] = {
 }
 
 
-def activated(op: Op, net: Importer, value: str) -> str:
+def add_activation(op: Op, net: Importer, value: str) -> str:
     """A result with the activation that the operator is told to apply. Raises UnsupportedOpError."""
     number = op.integer("activation")
     if not number:
         return value
     if _NAMES.get(number) not in _APPLIED:
-        raise op.refused(f"it applies the activation {number}, which is not read")
+        raise op.refusal(f"it applies the activation {number}, which is not read")
     return _APPLIED[_NAMES[number]](net, value)
 
 
@@ -56,7 +56,7 @@ def _same(kind: str) -> Translate:
 
 
 def _arithmetic(kind: str) -> Translate:
-    return lambda op, net: activated(op, net, net.add(kind, op.operands()))
+    return lambda op, net: add_activation(op, net, net.add(kind, op.operands()))
 
 
 def _plain(function: Callable[[Builder, str], str]) -> Translate:
@@ -85,7 +85,7 @@ def _gelu(op: Op, net: Importer) -> str:
 
 
 def _unit_length(op: Op, net: Importer) -> str:
-    return activated(op, net, unit_length(net, op.need(0), net.rank(op.need(0)) - 1))
+    return add_activation(op, net, unit_length(net, op.need(0), net.rank(op.need(0)) - 1))
 
 
 def _select(op: Op, net: Importer) -> str:

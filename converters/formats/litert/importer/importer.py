@@ -8,7 +8,7 @@ import numpy as np
 
 from converters.formats.litert.flatbuffer import Table
 from converters.formats.litert.importer.operator import Op, Translate
-from converters.formats.litert.tensors import UNNAMED, Tensors, damaged
+from converters.formats.litert.tensors import UNNAMED, Tensors, damaged_error
 from converters.formats.onnx.importer.importer import node_name
 from converters.graph.builder import Builder
 from converters.graph.nodes import NameScope, Node, TensorShape, ref
@@ -41,7 +41,7 @@ class Importer(Builder):
 
     def _input(self, number: int, port: str) -> None:
         if number in self.values:
-            raise damaged(f"tensor {number} is an input twice")
+            raise damaged_error(f"tensor {number} is an input twice")
         dims = TensorShape(self.tensors.dims(number))
         attrs = {"dtype": self.tensors.dtype(number), "shape": dims}
         name = self.names.fresh(node_name(port))
@@ -58,7 +58,7 @@ class Importer(Builder):
         if number not in self.values:
             value = self.tensors.constant(number)
             if value is None:
-                raise damaged(
+                raise damaged_error(
                     f"tensor {number} ({self.tensors.name(number)!r}) is read, and nothing makes it before that"
                 )
             self.values[number] = self._constant(number, value)
@@ -92,14 +92,14 @@ class Importer(Builder):
         """Make what an operator becomes. Raises UnsupportedOpError, DamagedFileError, GraphError."""
         inputs, outputs = ([int(i) for i in operator.get(side, ())] for side in ("inputs", "outputs"))
         if not outputs or any(i in self.values for i in outputs) or len(set(outputs)) < len(outputs):
-            raise damaged(f"an operator {kind} makes nothing, or tensors that were made before")
+            raise damaged_error(f"an operator {kind} makes nothing, or tensors that were made before")
         name = self.tensors.name(outputs[0])
         if kind == "DEQUANTIZE":
             self._widen(kind, name, inputs, outputs)
             return
         function = table.get(kind)
         if function is None:
-            raise _unknown(kind, name)
+            raise _unknown_operator_error(kind, name)
         for number in (*inputs, *outputs):
             self.tensors.check_plain(number, kind)
         dtypes = tuple(self.tensors.dtype(i) for i in outputs)
@@ -111,13 +111,13 @@ class Importer(Builder):
         try:
             results = function(op, self)
         except UnsupportedOpError as error:
-            raise (error if error.issues else op.refused(error.what, error.why, error.fix)) from error
+            raise (error if error.issues else op.refusal(error.what, error.why, error.fix)) from error
         except MISFIT as error:
             why = f"{type(error).__name__}: {error}"
-            raise op.refused("it has operands or options that LiteRT does not allow", why) from error
+            raise op.refusal("it has operands or options that LiteRT does not allow", why) from error
         made = [results] if isinstance(results, str) else list(results)
         if len(made) != len(outputs):
-            raise damaged(f"{kind} (tensor {name!r}) has {len(outputs)} results instead of {len(made)}")
+            raise damaged_error(f"{kind} (tensor {name!r}) has {len(outputs)} results instead of {len(made)}")
         whole = len(made) > 1 and made == [ref(made[0], i) for i in range(len(made))]
         first = self._finish(made[0], started, node, name)
         self.values[outputs[0]] = first
@@ -141,7 +141,7 @@ class Importer(Builder):
         """Weights that are kept in fewer bytes, as the floats that they stand for."""
         value = self.tensors.widened(inputs[0]) if len(inputs) == len(outputs) == 1 else None
         if value is None:
-            raise Op(kind, name, (), {}, ()).refused(
+            raise Op(kind, name, (), {}, ()).refusal(
                 "it turns integers that the model computes with into floats", _INTEGERS, _FLOATS
             )
         self.widened = True
@@ -164,9 +164,9 @@ _REASONS: tuple[tuple[tuple[str, ...], str, str], ...] = (
 )
 
 
-def _unknown(kind: str, name: str) -> UnsupportedOpError:
+def _unknown_operator_error(kind: str, name: str) -> UnsupportedOpError:
     op = Op(kind, name, (), {}, ())
     for beginnings, why, fix in _REASONS:
         if kind.startswith(beginnings):
-            return op.refused("it is not read", why, fix)
-    return op.refused("no entry of the table of LiteRT's operators covers it")
+            return op.refusal("it is not read", why, fix)
+    return op.refusal("no entry of the table of LiteRT's operators covers it")

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from converters.formats.litert.importer.elementwise import activated
+from converters.formats.litert.importer.elementwise import add_activation
 from converters.formats.litert.importer.importer import KERNELS, Importer
 from converters.formats.litert.importer.operator import Op, Translate
 from converters.formats.litert.schema import PADDINGS
@@ -19,7 +19,7 @@ def _fully_connected(op: Op, net: Importer) -> str:
     """Rows of the last axis (or of as many numbers as a result has weights), times a matrix with a row per result."""
     x, weights = op.need(0), op.need(1)
     if op.integer("weights_format"):
-        raise op.refused("its weights are shuffled, for a model that is quantised")
+        raise op.refusal("its weights are shuffled, for a model that is quantised")
     turned = weights in net.kernels
     results, size = (net.length(weights, i) for i in ((1, 0) if turned else (0, 1)))
     shape = net.type_of(x).shape
@@ -38,7 +38,7 @@ def _with_bias(op: Op, net: Importer, value: str) -> str:
         number = net.constant(bias)
         added = number is None or number.any() or not net.is_unnamed(bias)
         value = net.add("BiasAdd", [value, bias]) if added else value
-    return activated(op, net, value)
+    return add_activation(op, net, value)
 
 
 def _batch_matmul(op: Op, net: Importer) -> str:
@@ -52,11 +52,11 @@ def _batch_matmul(op: Op, net: Importer) -> str:
 def _windows(op: Op, **more: Any) -> dict[str, Any]:
     padding = _PADDING.get(op.integer("padding"))
     if padding is None:
-        raise op.refused(f"its padding is {op.integer('padding')}, which is neither SAME nor VALID")
+        raise op.refusal(f"its padding is {op.integer('padding')}, which is neither SAME nor VALID")
     return {"padding": padding, "strides": (1, op.integer("stride_h"), op.integer("stride_w"), 1), **more}
 
 
-def _dilated(op: Op) -> dict[str, Any]:
+def _dilated_windows(op: Op) -> dict[str, Any]:
     down, across = (op.integer(f"dilation_{side}_factor", 1) for side in ("h", "w"))
     return _windows(op, dilations=(1, down, across, 1))
 
@@ -67,10 +67,10 @@ def _conv2d(op: Op, net: Importer) -> str:
         kernel = net.transpose(kernel, KERNELS[op.kind])
     channels, taken = net.length(image, 3), net.length(kernel, 2)
     if channels != taken:
-        raise op.refused(
+        raise op.refusal(
             f"its image has {channels} channels, and a filter takes {taken}", "filters in groups are not read"
         )
-    return _with_bias(op, net, net.add("Conv2D", [image, kernel], **_dilated(op)))
+    return _with_bias(op, net, net.add("Conv2D", [image, kernel], **_dilated_windows(op)))
 
 
 def _depthwise(op: Op, net: Importer) -> str:
@@ -79,15 +79,15 @@ def _depthwise(op: Op, net: Importer) -> str:
     _, height, width, results = kernel.shape
     channels = net.length(image, 3)
     if kernel.shape[0] != 1 or not channels or results % channels:
-        raise op.refused(f"its kernel {list(kernel.shape)} does not fit an image of {channels} channels")
+        raise op.refusal(f"its kernel {list(kernel.shape)} does not fit an image of {channels} channels")
     own = net.const(kernel.reshape(height, width, channels, results // channels), "kernel")
-    return _with_bias(op, net, net.add("DepthwiseConv2dNative", [image, own], **_dilated(op)))
+    return _with_bias(op, net, net.add("DepthwiseConv2dNative", [image, own], **_dilated_windows(op)))
 
 
 def _pool(kind: str) -> Translate:
     def translate(op: Op, net: Importer) -> str:
         size = (1, op.integer("filter_height"), op.integer("filter_width"), 1)
-        return activated(op, net, net.add(kind, [op.need(0)], **_windows(op, ksize=size)))
+        return add_activation(op, net, net.add(kind, [op.need(0)], **_windows(op, ksize=size)))
 
     return translate
 
@@ -96,7 +96,7 @@ def _pad(op: Op, net: Importer) -> str:
     operands = op.operands()
     paddings = net.needed_constant(operands[1], "the paddings").astype(np.int64)
     if (paddings < 0).any():
-        raise op.refused("it pads by less than nothing")
+        raise op.refusal("it pads by less than nothing")
     return net.add("Pad" if len(operands) == 2 else "PadV2", operands)
 
 

@@ -35,7 +35,7 @@ class Op:
         """A required operand. Raises UnsupportedOpError."""
         found = self.get(position)
         if found is None:
-            raise self.refused(f"operand {position} is missing", "the operator cannot be computed without it")
+            raise self.refusal(f"operand {position} is missing", "the operator cannot be computed without it")
         return found
 
     def operands(self) -> list[str]:
@@ -58,7 +58,7 @@ class Op:
         """An option that is a vector of integers."""
         return [int(n) for n in self.options.get(option, ())]
 
-    def refused(self, what: str, why: str | None = None, fix: str | None = None) -> UnsupportedOpError:
+    def refusal(self, what: str, why: str | None = None, fix: str | None = None) -> UnsupportedOpError:
         """The error that this operator is not converted."""
         return UnsupportedOpError(
             f"cannot convert {self.kind} (tensor {self.name!r}): {what}",
