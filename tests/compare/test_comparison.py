@@ -258,7 +258,7 @@ def test_an_input_that_is_missing_or_too_much(bundles: Bundles, tmp_path: Path, 
     assert report.passed is False
     reasons = {f.output: f.reason for f in report.failures}
     assert "missing input 'action_masks'" in reasons["action_masks"]
-    assert "an input 'temperature' that the reference has not" in reasons["temperature"]
+    assert "an input 'temperature' that is not in the reference" in reasons["temperature"]
 
 
 def test_a_batch_that_is_frozen_or_another_width_is_said(bundles: Bundles, tmp_path: Path, pool: RuntimePool) -> None:
