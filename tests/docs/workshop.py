@@ -196,5 +196,7 @@ HOW = {
     "json": Workshop.json,
     "text": Workshop.shown,
     "csharp": Workshop.shown,
+    "kotlin": Workshop.shown,
+    "swift": Workshop.shown,
     "": Workshop.shown,
 }

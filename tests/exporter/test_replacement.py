@@ -33,7 +33,7 @@ from exporter.cli.main import main
 point, *arguments = sys.argv[1:]
 kind, _, number = point.partition(":")
 left = int(number or 0)
-write, pieces, rename, exchange, remove = Path.write_bytes, Pieces.write, Path.rename, swap._exchanged, shutil.rmtree
+write, pieces, rename, exchange, remove = Path.write_bytes, Pieces.write, Path.rename, swap._exchange, shutil.rmtree
 
 def die():
     os.kill(os.getpid(), signal.SIGKILL)
@@ -70,9 +70,9 @@ def dying_exchange(a, b):
 if kind == "write":
     Path.write_bytes, Pieces.write = dying_write, dying_pieces
 elif kind.endswith("exchange"):
-    swap._exchanged = dying_exchange
+    swap._exchange = dying_exchange
 else:  # a system without an exchange
-    swap._exchanged = lambda a, b: False
+    swap._exchange = lambda a, b: False
     if kind == "rename":
         Path.rename = dying_rename
     else:

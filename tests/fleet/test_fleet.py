@@ -125,7 +125,7 @@ def test_without_a_place_for_a_key_all_is_exported(tmp_path: Path, monkeypatch: 
     assert not (tmp_path / "out" / ".exported.jsonl").exists()
 
 
-@pytest.mark.parametrize("step", ["compiled", "written"])
+@pytest.mark.parametrize("step", ["compile_source", "write_jobs"])
 @pytest.mark.parametrize("kind", ["file", "folder"])
 def test_what_changes_while_it_is_exported_is_exported_again(
     kind: str, step: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -67,7 +67,7 @@ def test_files_in_a_folder_are_one_source_each(place: Path) -> None:
     assert sources_in([Path("runs/a")], Path("out")) == [Path("runs/a/one.bytes"), Path("runs/a/two.bytes")]
 
 
-@pytest.mark.parametrize(("given", "words"), [("*.onnx", "stands for no source"), ("empty", "no model found in")])
+@pytest.mark.parametrize(("given", "words"), [("*.onnx", "matches no model"), ("empty", "no model found in")])
 def test_what_stands_for_nothing_is_refused(given: str, words: str, place: Path) -> None:
     (place / "empty").mkdir()
     with pytest.raises(ExportModelError, match=words):

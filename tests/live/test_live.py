@@ -108,7 +108,7 @@ REFUSED = {
     "no session": ("UsageError", "must be a tf.compat.v1.Session; it is a Graph"),
     "closed": ("UsageError", "the session cannot be run"),
     "not initialised": ("NotAPolicyError", "no value for the variable 'dense/kernel' (and 1 more)"),
-    "without a policy": ("SignatureError", "not clear which output is the action"),
+    "without a policy": ("SignatureError", "cannot tell which output is the action"),
     "a session and a function": ("UsageError", "session and tf_function were given"),
     "a step": ("UsageError", "step=3"),
     "no function": ("UsageError", "must be a tf.function"),

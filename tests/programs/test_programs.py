@@ -81,7 +81,7 @@ def test_every_policy_acts_alike(
 def test_the_same_policy_gives_the_same_bytes(name: str, form: Format) -> None:
     def write() -> list[bytes]:
         artefacts = [form.artifact(p, WriteOptions("{}")) for p in read_source(path(name)).policies()]
-        return [data.joined() for a in artefacts for data in a.files.values()]
+        return [data.to_bytes() for a in artefacts for data in a.files.values()]
 
     assert write() == write()
 

@@ -270,7 +270,7 @@ def test_a_source_is_exported_for_the_page(bundle: Bundle, tmp_path: Path) -> No
     place = tmp_path / "page"
     ran = export_model("serve", fixture("continuous"), "--out", place)
     assert ran.status == 0
-    assert "not compared" in ran.err
+    assert "not verified" in ran.err
     assert (place / "model" / "model.json").read_bytes() == assemble(bundle("continuous"))["model/model.json"]
     is_refused(export_model("serve", fixture("twobrains"), "--out", place), "holds 2 policies", "-o exported")
 
