@@ -67,7 +67,7 @@ def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def artefacts(bundle: Path) -> Iterator[tuple[str, str, Path]]:
-    """(format, runtime, path): each runtime once, but litert-web: it takes no free batch, and has the kernels of litert."""
+    """(format, runtime, path): each runtime once, but litert-web: no free batch, and the kernels of litert."""
     installed = {r.name for r in available_runtimes() if r.installed}
     for runtime in RUNTIMES:
         key = next((k for k in ("bytes", "onnx", "tfjs", "litert") if runtime.name in WRITTEN[k].runtimes), None)
