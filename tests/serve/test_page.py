@@ -226,7 +226,7 @@ def test_a_hand_a_comparison_and_a_drop(bundle: Bundle, tmp_path: Path) -> None:
             ["eval", STATUS],
             ["eval", "location.hash"],
             ["drop", [["notes.txt", ""]]],
-            ["wait", f"{said}.includes('no tfjs/model.json')"],
+            ["wait", f"{said}.includes('neither a tfjs/model.json')"],
             ["drop", [["model.json", base64.b64encode(b'{"modelTopology": {"node": []}}').decode()]]],
             ["wait", f"{said}.includes('no contract of export-model')"],
             ["drop", whole],
