@@ -43,7 +43,6 @@ def image(folder: Path, name: str) -> Path:
 @pytest.mark.parametrize(
     ("names", "maker"),
     [
-        ({"model": ["a2c_network.actor_mlp.0.weight", "a2c_network.mu.weight"], "epoch": []}, "rl_games"),
         ({"policy": ["net_container.0.weight", "log_std_parameter"], "optimizer": []}, "skrl"),
         ({"policy": ["net.0.weight"], "state_preprocessor": ["running_mean"]}, "skrl"),
         ({"actor.preprocess.model.model.0.weight": None}, "Tianshou"),

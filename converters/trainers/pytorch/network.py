@@ -6,13 +6,16 @@ Source: mlagents/trainers/torch_entities/{layers,encoders,distributions}.py of 1
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
+from collections.abc import Sequence
 
 import numpy as np
 
 from converters.graph.builder import Builder
 from converters.graph.nn.activations import Activation, clip
+from converters.graph.nn.convolution import Window, conv2d
 from converters.graph.nn.linear import matmul
 from converters.graph.nn.recurrent import gru, lstm
 from converters.graph.nodes import NameScope, Node
@@ -21,6 +24,9 @@ from converters.trainers.pytorch.weights import Weights
 
 #: Added before a logarithm (``EPSILON`` in distributions.py).
 TINY = 1e-7
+#: What a forbidden action's logit becomes: sb3_contrib/common/maskable/distributions.py, and rl_games'
+#: common/extensions/distributions.py.
+_FORBIDDEN = -1e8
 _TO_NHWC, _TO_NCHW = (0, 2, 3, 1), (0, 3, 1, 2)
 
 
@@ -147,16 +153,18 @@ class Network(Builder):
 
     def convolution(self, image: str, module: str, stride: int, padding: str = "VALID") -> str:
         """``nn.Conv2d`` on [B, H, W, C]; ``SAME`` is a padding of 1 around a kernel of 3 at stride 1."""
-        self.at(module)
-        kernel = self.state.array(f"{module}.weight", None, self.width(image), None, None)
-        bias = self.state.array(f"{module}.bias", len(kernel))
-        value = self.add(
-            "Conv2D",
-            [image, self.const(np.ascontiguousarray(kernel.transpose(2, 3, 1, 0)), "kernel")],
-            strides=(1, stride, stride, 1),
-            dilations=(1, 1, 1, 1),
-            padding=padding,
+        kernel = self.state.shape(f"{module}.weight")
+        window = Window(
+            (kernel[-2], kernel[-1]) if len(kernel) == 4 else (1, 1), (stride, stride), same=padding == "SAME"
         )
+        return self.convolve(image, module, window)
+
+    def convolve(self, image: str, module: str, window: Window) -> str:
+        """``nn.Conv2d`` on [B, H, W, C] with any strides and paddings; the kernel must have the window's size."""
+        self.at(module)
+        kernel = self.state.array(f"{module}.weight", None, self.width(image), *window.size)
+        bias = self.state.array(f"{module}.bias", len(kernel))
+        value = conv2d(self, image, np.ascontiguousarray(kernel.transpose(2, 3, 1, 0)), window)
         return self.add("BiasAdd", [value, self.const(bias, "bias")])
 
     def max_pool(self, image: str) -> str:
@@ -197,6 +205,19 @@ class Network(Builder):
     def choice(self, logits: str) -> str:
         """A class of each row, drawn by its logits: int64 [B, 1]."""
         return self.add("Multinomial", [logits, self.ints(1, "count")], output_dtype=INT64)
+
+    def choices(self, logits: str, sizes: Sequence[int]) -> str:
+        """A class of each branch, drawn by its part of the logits: int64 [B, branches]."""
+        starts = [0, *itertools.accumulate(sizes)]
+        parts = [self.slice(logits, 1, *ends) if len(sizes) > 1 else logits for ends in itertools.pairwise(starts)]
+        drawn = [self.choice(part) for part in parts]
+        return drawn[0] if len(drawn) == 1 else self.concat(drawn, 1)
+
+    def forbid(self, logits: str, masks: str) -> str:
+        """The logits, −1e8 where the masks are 0."""
+        kept = self.add("Mul", [logits, masks])
+        blocked = self.add("Sub", [self.floats(1), masks])
+        return self.add("Add", [kept, self.add("Mul", [blocked, self.floats(_FORBIDDEN)])])
 
     def branch(self, x: str, module: str, masks: str, start: int, *, twice: bool, preview: bool = False) -> str:
         """The probabilities of one branch of ``MultiCategoricalDistribution``, [B, actions].

@@ -32,8 +32,6 @@ from signatures.roles import Role
 _EXPORT_ONNX = "export the model to ONNX in its own project (torch.onnx.export), and give that"
 #: What a space is: one, or several by their keys.
 Observed: TypeAlias = "Space | Mapping[str, Space]"
-#: What a forbidden action's logit becomes (sb3_contrib/common/maskable/distributions.py).
-_FORBIDDEN = -1e8
 #: What no action depends on.
 _TRAINING = (
     *("value_net.", "mlp_extractor.value_net.", "vf_features_extractor.", "lstm_critic.", "critic.", "critic_target."),
@@ -420,9 +418,7 @@ def _masks(made: _Built, count: int, logits: str) -> str:
     net = made.net
     masks = net.input("action_masks", count)
     net.at("action")
-    kept = net.add("Mul", [logits, masks])
-    blocked = net.add("Sub", [net.floats(1), masks])
-    return net.add("Add", [kept, net.add("Mul", [blocked, net.floats(_FORBIDDEN)])])
+    return net.forbid(logits, masks)
 
 
 def _highest(made: _Built, values: str) -> None:

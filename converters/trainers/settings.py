@@ -1,0 +1,134 @@
+"""What a trainer wrote beside a checkpoint about its network: a YAML file, asked key by key, with types."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from converters.files.fetch import Fetched
+from converters.files.yaml_data import MAX_YAML_BYTES, read_yaml
+from converters.graph.nn.activations import Activation
+from converters.trainers.pytorch.activations import activation_named
+from signatures.errors import SourceError
+
+#: Folders of a run that hold its checkpoints alone: the settings lie one folder up.
+_OF_CHECKPOINTS = re.compile("nn|checkpoints")
+MAX_LAYERS = 64
+#: Numbers that a layer gives.
+MAX_UNITS = 1 << 16
+
+
+class Settings:
+    """A mapping of a settings file. ``place`` is its path of keys in ``file``, as errors name it.
+
+    Each question raises SourceError, with the key, where the value has another type or is outside its bounds.
+    """
+
+    def __init__(self, values: Mapping[str, Any], file: str, place: str = "") -> None:
+        self.values, self.file, self.place = values, file, place
+
+    def __contains__(self, key: str) -> bool:
+        return self.values.get(key) is not None
+
+    def section(self, key: str) -> Settings:
+        """Return a mapping below this one; an empty one where the key is missing."""
+        value = self.values.get(key)
+        if value is not None and not isinstance(value, dict):
+            raise self.error(key, "must be a mapping")
+        return Settings(value or {}, self.file, self._path(key))
+
+    def sections(self, key: str) -> list[Settings]:
+        """Return the mappings of a list; of a mapping, its values."""
+        value = self.values.get(key)
+        items = list(value.values()) if isinstance(value, dict) else value
+        if not isinstance(items, list) or len(items) > MAX_LAYERS or not all(isinstance(v, dict) for v in items):
+            raise self.error(key, f"must be a list of at most {MAX_LAYERS} mappings")
+        return [Settings(v, self.file, f"{self._path(key)}[{i}]") for i, v in enumerate(items)]
+
+    def text(self, key: str, default: str | None = None) -> str:
+        """Return a text; ``default`` (None: there must be one) where the key is missing."""
+        value = self.values.get(key)
+        value = default if value is None else value
+        if not isinstance(value, str):
+            raise self.error(key, "must be text")
+        return value
+
+    def flag(self, key: str, *, default: bool = False) -> bool:
+        """Return true or false."""
+        value = self.values.get(key)
+        if value is not None and not isinstance(value, bool):
+            raise self.error(key, "must be true or false")
+        return default if value is None else value
+
+    def number(self, key: str, default: float) -> float:
+        """Return a number. YAML 1.1 takes ``1e-3`` for text: it is a number here."""
+        value = self.values.get(key)
+        try:
+            number = float(default if value is None or isinstance(value, bool) else value)
+        except (TypeError, ValueError) as error:
+            raise self.error(key, "must be a number") from error
+        if not math.isfinite(number):
+            raise self.error(key, "must be finite")
+        return number
+
+    def sizes(self, key: str) -> list[int]:
+        """Return a list of lengths, each at least 1."""
+        value = self.values.get(key)
+        if not isinstance(value, list) or len(value) > MAX_LAYERS or not all(map(_is_size, value)):
+            raise self.error(key, f"must be a list of at most {MAX_LAYERS} numbers from 1 to {MAX_UNITS}")
+        return value
+
+    def pair(self, key: str, default: int, least: int = 1) -> tuple[int, int]:
+        """Return a number for height and width, or one for both."""
+        value = self.values.get(key, default)
+        both = value if isinstance(value, list) else [value, value]
+        if len(both) != 2 or not all(_is_size(v, least) for v in both):
+            raise self.error(key, f"must be a number from {least} on, or two")
+        return both[0], both[1]
+
+    def activation(self, key: str, default: str | None = None) -> Activation:
+        """Return the activation of the name that stands there."""
+        name = self.text(key, default)
+        found = activation_named(name)
+        if found is None:
+            raise self.error(key, f"is {name[:40]!r}, which is not an activation that is known")
+        return found
+
+    def error(self, key: str, what: str) -> SourceError:
+        """Return the refusal of a value."""
+        return SourceError(
+            f"{self.file}: {self._path(key)} {what}",
+            why="it says how the network of the checkpoint is built",
+            fix="give the file that the training wrote, unchanged, next to the checkpoint",
+        )
+
+    def _path(self, key: str) -> str:
+        return f"{self.place}.{key}" if self.place else key
+
+
+def _is_size(value: object, least: int = 1) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and least <= value <= MAX_UNITS
+
+
+def find_settings(given: Fetched, names: Sequence[str], keys: Sequence[str]) -> tuple[Settings, Path] | None:
+    """Return the first file of these names that has one of ``keys`` at its top, and its path; None where none has.
+
+    They are looked for beside the checkpoint, and beside the folder that a run keeps its checkpoints in.
+    Raises SourceError where the file is not read, RuntimeUnavailableError without PyYAML.
+    """
+    folder = given.path.parent
+    for place in (folder, *((folder.parent,) if _OF_CHECKPOINTS.fullmatch(folder.name) else ())):
+        for name in names:
+            file = place / name
+            try:
+                if not file.is_file() or file.stat().st_size > MAX_YAML_BYTES:
+                    continue
+            except OSError:
+                continue
+            values = read_yaml(given.bytes_of(file, empty=True), name)
+            if isinstance(values, dict) and any(isinstance(values.get(key), dict) for key in keys):
+                return Settings(values, name), file
+    return None
