@@ -26,6 +26,7 @@ from exporter.play.worlds import MakeWorld
 from exporter.remote.fetching import nearby
 from exporter.verify.options import VerifyOptions
 from exporter.verify.report import ParityReport
+from signatures.code import code_options
 from signatures.errors import ParityError, UsageError
 
 # What a program logs is found under the package's name, whichever module does the job.
@@ -83,6 +84,7 @@ def export(
         profile=for_,
         weights=storage(write.dtype, write.quantize),
         batch=write.batch,
+        code=code_options(math=write.math),
     )
     live = {"session": session, "tf_function": tf_function, "keras_model": keras_model}
     with _sources(source, live, read.step) as sources:

@@ -64,6 +64,8 @@ class WriteOptions:
     quantize: str | None = None
     #: Write ONNX and LiteRT files for this many agents at a time (default: any number).
     batch: int | None = None
+    #: Source code computes exp, log, tanh and others by its ``own`` functions, with the same bits everywhere.
+    math: str = "library"
     #: Names of observations and actions: a file or a mapping.
     labels: Labels | None = None
 

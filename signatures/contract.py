@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from signatures.bounded import loads
+from signatures.code import CHOICES
 from signatures.fields import Field, FieldError, without_none
 from signatures.labels import parse_labels
 from signatures.memories import SourcePart
@@ -172,8 +173,14 @@ def parse(content: Any) -> Contract:
         profile=None if tool["profile"].missing else tool["profile"].text(),
         weights=None if tool["weights"].missing else tool["weights"].one_of(("float16", "int8")),
         batch=None if tool["batch"].missing else tool["batch"].integer(1),
+        code=None if tool["code"].missing else _code(tool["code"]),
     )
     return Contract(name.value, signature, origin, parse_source_map(source, signature), made, files)
+
+
+def _code(said: Field) -> dict[str, Any]:
+    """How source code was written, as far as it is not as usual."""
+    return {key: said[key].one_of(choices) for key, choices in CHOICES.items() if not said[key].missing}
 
 
 def parse_signature(whole: Field) -> PolicySignature:

@@ -14,6 +14,7 @@ from dataclasses import field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from signatures.code import CodeOptions
 from signatures.records import dataclass
 
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ class WriteOptions:
     """What a writer needs beside the policy: the contract as JSON text, the ONNX opset, the profile's name where the
     file is made for one consumer (``--for``), whether the result is to be proved valid (ONNX: by its checker), how
     weights that were rounded are kept, for how many agents the file is (None: for any number), and the ONNX ops that
-    the consumer lacks or misreads in some form.
+    the consumer lacks or misreads in some form; ``code`` is how source code is written.
     """
 
     contract: str
@@ -66,6 +67,7 @@ class WriteOptions:
     weights: Storage = "float32"
     batch: int | None = None
     misread: frozenset[str] = frozenset()
+    code: CodeOptions = CodeOptions()
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,6 +15,7 @@ from exporter.cli.options import (
     RULES,
     activating,
     as_given,
+    coding,
     comparing,
     located,
     normalising,
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from exporter.play.report import PlayReport
     from exporter.reports.entry import Entry
     from exporter.verify.options import VerifyOptions
+    from signatures.code import CodeOptions
     from signatures.errors import ExportModelError
 
 
@@ -77,6 +79,7 @@ if TYPE_CHECKING:
     help="The type that weights are stored in.",
 )
 @click.option("--quantize", type=click.Choice(["int8"]), help="Store each weight in one byte.")
+@coding
 @click.option("--batch", type=int, metavar="N", help="Write files for N agents at a time (ONNX, LiteRT).")
 @click.option("--labels", type=PATH, metavar="FILE", help="Names of observations and actions.")
 @click.option("--opset", type=int, metavar="N", help="ONNX opset (default: 15).")
@@ -106,6 +109,7 @@ def export_command(
     dtype: str,
     quantize: str | None,
     batch: int | None,
+    code: CodeOptions,
     env: str | None,
     jobs: int | None,
     cluster: str | None,
@@ -141,6 +145,7 @@ def export_command(
         profile,
         storage(dtype, quantize),
         batch,
+        code,
     )
     many = (
         again or fail_fast or is_many(sources) or address_of(out) is not None or jobs is not None or cluster is not None

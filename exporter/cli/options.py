@@ -172,6 +172,22 @@ def understanding(command: Callable[..., Any]) -> Callable[..., Any]:
     return parse_and_call
 
 
+def coding(command: Callable[..., Any]) -> Callable[..., Any]:
+    """How source code is written; the command gets it as ``code``, a CodeOptions."""
+
+    @functools.wraps(command)
+    def parse_and_call(*args: Any, math: str, **rest: Any) -> Any:
+        from signatures.code import code_options
+
+        return command(*args, code=code_options(math=math), **rest)
+
+    for option in (
+        click.option("--math", metavar="WHOSE", default="library", help="own: the same bits everywhere (source code)."),
+    ):
+        parse_and_call = option(parse_and_call)
+    return parse_and_call
+
+
 def _required_formats(given: str | None, *, unverified: bool) -> tuple[str, ...]:
     """Return the formats of ``--require``. Raises UsageError."""
     if given is None:

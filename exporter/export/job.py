@@ -18,6 +18,7 @@ from converters.policy.policy import Policy
 from exporter import __version__
 from exporter.export.options import ExportOptions
 from exporter.export.sources import Source
+from signatures.code import CodeOptions
 from signatures.contract import Contract, Origin, parse
 from signatures.errors import SignatureError, TooLargeError, UsageError, naming
 from signatures.fields import FieldError, printable, without_none
@@ -63,10 +64,15 @@ def artefacts_of(
             None if job.profile is None else job.profile.name,
             None if job.whole is None else options.weights,
             job.batch,
+            options.code,
         )
         if job.profile is None:
             how = WriteOptions(
-                contract.compact(), checked=options.verify != "none", weights=options.weights, batch=options.batch
+                contract.compact(),
+                checked=options.verify != "none",
+                weights=options.weights,
+                batch=options.batch,
+                code=options.code,
             )
             if options.opset is not None:
                 how = replace(how, opset=options.opset)
@@ -99,6 +105,7 @@ def contract_of(
     profile: str | None = None,
     weights: str | None = None,
     batch: int | None = None,
+    code: CodeOptions | None = None,
 ) -> Contract:
     """The contract as every artefact embeds it. Raises SignatureError where it could not be read back."""
     origin = Origin(
@@ -111,7 +118,10 @@ def contract_of(
         read.activation,
         None if read.normaliser is None else printable(Path(read.normaliser).name),
     )
-    tool = without_none(name="export-model", version=__version__, profile=profile, weights=weights, batch=batch)
+    said = None if code is None else code.to_dict() or None
+    tool = without_none(
+        name="export-model", version=__version__, profile=profile, weights=weights, batch=batch, code=said
+    )
     contract = Contract(policy.name, policy.signature, origin, policy.source, tool)
     try:
         parse(contract.to_dict())
@@ -199,6 +209,18 @@ def check_batch(options: ExportOptions, formats: Sequence[Format]) -> None:
             f"--batch does not go with --to {','.join(f.key for f in formats)}",
             why="such files take any number of agents",
             fix=f"write those for which some consumers ask for a fixed one: --to {able}",
+        )
+
+
+def check_code(options: ExportOptions, formats: Sequence[Format]) -> None:
+    """Raise UsageError where source code is to be written in some way and none is."""
+    said = options.code.to_dict()
+    if said and not any(f.program for f in formats):
+        (key, value), *_ = said.items()
+        raise UsageError(
+            f"--{key} {value} does not go with --to {','.join(f.key for f in formats)}",
+            why="it says how source code is written",
+            fix=f"add a format to --to: {', '.join(f.key for f in WRITTEN.values() if f.program)}",
         )
 
 

@@ -12,6 +12,7 @@ from converters.compiler.passes.weights import Storage
 from converters.formats.source import ReadOptions
 from exporter.export.labels import Labels
 from exporter.verify.options import VerifyOptions
+from signatures.code import CodeOptions
 from signatures.errors import UsageError
 from signatures.records import dataclass
 
@@ -37,6 +38,8 @@ class ExportOptions:
     weights: Storage = "float32"
     #: for how many agents the files are (``--batch``; None: for any number)
     batch: int | None = None
+    #: how source code is written (``--math``)
+    code: CodeOptions = CodeOptions()
 
 
 def storage(dtype: str, quantize: str | None) -> Storage:

@@ -19,6 +19,7 @@ from exporter.export.job import (
     Job,
     artefacts_of,
     check_batch,
+    check_code,
     check_weights,
     fix_batch,
     own_in,
@@ -118,6 +119,7 @@ class Exporter:
             raise UsageError("--to names no format", fix=f"the formats are {', '.join(WRITTEN)}")
         check_weights(options, self._formats)
         check_batch(options, self._formats)
+        check_code(options, self._formats)
         self._profile = wanted
         #: None where the writers of its formats give a policy the consumer's names
         self._dress = None if wanted is None or self._formats[0].key in wanted.own_names else wanted.dress

@@ -16,8 +16,8 @@ from converters.files.children.process import RunFailedError
 from converters.formats.format import WriteOptions
 from converters.formats.programs.members import answers, header_of
 from converters.formats.registry import WRITTEN
+from converters.graph.language import comment
 from converters.graph.nodes import Graph, Node, TensorShape
-from converters.graph.printer import comment
 from converters.graph.types import FLOAT32, INT32
 from converters.runtimes.c import COMPILERS, compiler
 from converters.runtimes.c.child import FLAGS

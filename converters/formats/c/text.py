@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from converters.graph.printer import Language, bare, lines_of, numbers
+from converters.graph.language import Language, bare, lines_of, numbers
 from converters.graph.program import Place
 from converters.graph.types import FLOAT32, INT64
 
@@ -23,6 +23,11 @@ _HELPERS = {
     "within": ("", "0 <= a && a < b ? a : (*outside = 1, 0)"),
     "intdiv": ("floorf(a / b)", "a / b - ((a % b != 0 && (a % b < 0) != (b < 0)) ? 1 : 0)"),
 }  # fmt: skip
+#: Functions of a number's bits: what they do, and what they take.
+_RAW = {
+    "bits": ("int32_t b; memcpy(&b, &a, sizeof b); return b;", "float"),
+    "of_bits": ("float b; memcpy(&b, &a, sizeof b); return b;", "int32_t"),
+}
 _SUFFIX = {"float": "f", "int32_t": "i", "int64_t": "l"}
 
 
@@ -31,8 +36,8 @@ class C(Language):
 
     functions = {name: f"{name}f({{0}})" for name in _SAME} | {"pow": "powf({0}, {1})"}
 
-    def __init__(self, prefix: str) -> None:
-        super().__init__()
+    def __init__(self, prefix: str, own: bool = False) -> None:
+        super().__init__(own)
         self.prefix = prefix
 
     def literal(self, value: float, dtype: np.dtype) -> str:
@@ -73,12 +78,26 @@ class C(Language):
     def helper(self, function: str, operands: Sequence[str], dtype: np.dtype) -> str:
         """A call of a function that the header brings along."""
         kind = C_TYPES[dtype.name]
+        if function in _RAW:
+            said, takes = _RAW[function]
+            name = f"{self.prefix}_{function}"
+            self.helpers[name] = f"static {kind} {name}({takes} a) {{ {said} }}"
+            return f"{name}({bare(operands[0])})"
         name = f"{self.prefix}_{function}{_SUFFIX[kind]}"
         takes = ", ".join(f"{kind} {a}" for a in "ab"[: len(operands)])
         if function == "within":
             takes, operands = f"{takes}, int *outside", [*operands, "&outside"]
         self.helpers[name] = f"static {kind} {name}({takes}) {{ return {_HELPERS[function][kind != 'float']}; }}"
         return f"{name}({', '.join(operands)})"
+
+    def own_name(self, function: str) -> str:
+        """As the C library's, behind the prefix."""
+        return f"{self.prefix}_{function}f"
+
+    def definition(self, name: str, takes: Sequence[str], lines: Sequence[str], result: str) -> str:
+        """A static function."""
+        words = ", ".join(f"float {a}" for a in takes)
+        return "\n".join([f"static float {name}({words})\n{{", *lines, f"    return {result};\n}}"])
 
     def draw(self) -> str:
         """The next number of an agent's stream."""

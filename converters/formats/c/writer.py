@@ -11,9 +11,11 @@ from converters.formats.c.text import C_TYPES, C
 from converters.formats.format import WriteOptions
 from converters.formats.programs.members import Field
 from converters.formats.programs.plan import CLOSE, ROWS, Plan, formula, plan_of
+from converters.graph.ops.loops.layers import box_muller, gumbel
 from converters.graph.printer import Printer
 from converters.graph.program import arena_of
 from converters.policy.policy import Policy
+from signatures.code import CodeOptions
 
 _DRAWS = """
 /* The stream of draws: splitmix64 (Steele, Lea and Flood 2014), its top 23 bits, in the middle of their step: above 0,
@@ -32,22 +34,36 @@ _NORMAL = """
 static void $P_normal($P_memory *memory, float *out, int count)
 {
     for (int i = 0; i < count; i++) {
-        const float radius = sqrtf(-2.0f * logf($P_uniform(memory)));
-        out[i] = radius * cosf(6.28318531f * $P_uniform(memory));
+        const float radius = $P_uniform(memory), turn = $P_uniform(memory);
+        out[i] = $X;
     }
 }
+"""
+_STRICT = """
+/* The same bits on every processor: every operation is rounded to float, and none is fused with another. */
+#if defined(__FAST_MATH__) || FLT_EVAL_METHOD < 0 || FLT_EVAL_METHOD == 1 || FLT_EVAL_METHOD == 2
+#error "compile without -ffast-math, and on x86 with -msse2 -mfpmath=sse"
+#endif
+#if defined(__clang__)
+#pragma STDC FP_CONTRACT OFF
+#elif defined(__GNUC__)
+#pragma GCC optimize ("fp-contract=off")
+#elif defined(_MSC_VER)
+#pragma fp_contract (off)
+#endif
 """
 
 
 def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
     """The header. Raises UnsupportedOpError."""
-    return {f"{policy.name}.h": Pieces(_text(policy.name, plan_of(policy, options)).encode("ascii"))}
+    text = _text(policy.name, plan_of(policy, options), options.code)
+    return {f"{policy.name}.h": Pieces(text.encode("ascii"))}
 
 
-def _text(name: str, plan: Plan) -> str:
+def _text(name: str, plan: Plan, code: CodeOptions) -> str:
     header, program = plan.header, plan.program
     p, state = header.prefix, header.state
-    words = C(p)
+    words = C(p, code.math == "own")
     printer = Printer(words, f"{p}_w_")
     by_name = {f.spec.name: f"input->{f.name}" for f in header.inputs}
     by_name |= {f.spec.name: f"memory->{f.name}" for f in header.fed if f not in header.inputs}
@@ -66,7 +82,8 @@ def _text(name: str, plan: Plan) -> str:
         source = printer.name(program.outputs[f.spec.name].place)
         body.append(f"    for (int i = 0; i < {f.size}; i++) {target}[i] = {source}[i];")
     sizes = plan.sizes
-    choose = _choose(p, plan.chosen, sizes) if plan.chosen else ""
+    choose = _choose(p, plan.chosen, sizes, printer.function(gumbel, "row[i]", "u")) if plan.chosen else ""
+    normal = printer.function(box_muller, "radius", "turn") if header.noise else ""
     draws = printer.draws or bool(header.noise) or bool(choose)
     parts = [
         f"/* {p}: a policy without a runtime. In one source file, write\n"
@@ -105,11 +122,12 @@ def _text(name: str, plan: Plan) -> str:
         f"int {p}_selftest({p}_memory *memory);\n#endif",
         *([f"/* Draw a class for each of {len(sizes)} branches. */\n{choose.splitlines()[0]};"] if choose else []),
         f"#ifdef __cplusplus\n}}\n#endif\n\n#endif\n\n"
-        f"#ifdef {p.upper()}_IMPLEMENTATION\n#include <math.h>\n#include <string.h>",
+        f"#ifdef {p.upper()}_IMPLEMENTATION\n#include <float.h>\n#include <math.h>\n#include <string.h>",
+        *([_STRICT.strip()] if words.own else []),
         *(words.constant(place, printer.name(place)) for place in program.constants),
-        *sorted(words.helpers.values()),
+        *words.helpers.values(),
         *([_DRAWS.replace("$P", p).strip()] if draws else []),
-        *([_NORMAL.replace("$P", p).strip()] if header.noise else []),
+        *([_NORMAL.replace("$P", p).replace("$X", normal).strip()] if header.noise else []),
         f"void {p}_reset({p}_memory *memory, uint64_t seed)\n{{\n    memset(memory, 0, sizeof *memory);\n"
         f"    memory->stream = seed;\n}}",
         f"int {p}_compute(const {p}_input *input, {p}_memory *memory, {p}_output *output)\n{{\n"
@@ -128,7 +146,7 @@ def _text(name: str, plan: Plan) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def _choose(prefix: str, field: Field, sizes: Sequence[int]) -> str:
+def _choose(prefix: str, field: Field, sizes: Sequence[int], drawn: str) -> str:
     """The function that draws classes by their log-probabilities, by the Gumbel trick."""
     return (
         f"void {prefix}_choose({prefix}_memory *memory, const {prefix}_output *output, int32_t *action)\n{{\n"
@@ -137,7 +155,7 @@ def _choose(prefix: str, field: Field, sizes: Sequence[int]) -> str:
         f"    for (int branch = 0; branch < {len(sizes)}; branch++) {{\n"
         f"        float best = -INFINITY;\n        action[branch] = 0;\n"
         f"        for (int i = 0; i < sizes[branch]; i++) {{\n"
-        f"            const float drawn = row[i] - logf(-logf({prefix}_uniform(memory)));\n"
+        f"            const float u = {prefix}_uniform(memory);\n            const float drawn = {drawn};\n"
         f"            if (best < drawn) {{ best = drawn; action[branch] = i; }}\n        }}\n"
         f"        row += sizes[branch];\n    }}\n}}"
     )

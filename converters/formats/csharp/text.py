@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from converters.graph.printer import Language, bare, lines_of, numbers
+from converters.graph.language import Language, bare, lines_of, numbers
+from converters.graph.ops.loops.base import Applied
 from converters.graph.program import Place
 from converters.graph.types import BOOL, FLOAT32, INT32, INT64
 
@@ -35,6 +36,20 @@ _HELPERS = {
 }  # fmt: skip
 _CALLED = {"expm1": "Expm1", "log1p": "Log1p", "erf": "Erf", "pow": "Pow", "max": "Max", "min": "Min", "abs": "Abs",
            "mod": "Mod", "intdiv": "IntDiv", "within": "Within"}  # fmt: skip
+
+
+#: Functions of a number's bits: without ``unsafe``, and older than BitConverter's.
+_RAW = {
+    "bits": ("Bits", "static int Bits(float a) { return new Word { number = a }.bits; }"),
+    "of_bits": ("OfBits", "static float OfBits(int a) { return new Word { bits = a }.number; }"),
+}
+_WORD = """// The bits of a number.
+[global::System.Runtime.InteropServices.StructLayout(global::System.Runtime.InteropServices.LayoutKind.Explicit)]
+struct Word
+{
+    [global::System.Runtime.InteropServices.FieldOffset(0)] public float number;
+    [global::System.Runtime.InteropServices.FieldOffset(0)] public int bits;
+}"""
 
 
 class CSharp(Language):
@@ -80,6 +95,10 @@ class CSharp(Language):
     def helper(self, function: str, operands: Sequence[str], dtype: np.dtype) -> str:
         """A call of a function that the class brings along."""
         kind = CS_TYPES[dtype.name]
+        if function in _RAW:
+            name, said = _RAW[function]
+            self.helpers |= {"Word": _WORD, name: said}
+            return f"{name}({bare(operands[0])})"
         takes = ", ".join(f"{kind} {a}" for a in "ab"[: len(operands)])
         given = "ab"[: len(operands)]
         name = _SAME.get(function) or _CALLED[function]
@@ -91,6 +110,19 @@ class CSharp(Language):
         said = said.replace("float r", f"{kind} r")
         self.helpers[f"{name} {kind}"] = f"static {kind} {name}({takes}) {{ {said} }}"
         return f"{name}({', '.join(bare(o) for o in operands)})"
+
+    def round_to(self, text: str, x: Applied) -> str:
+        """What an operator gives; a cast rounds it where a processor, or a virtual machine, has more digits."""
+        return f"(float){text}" if self.own and x.dtype == FLOAT32 else text
+
+    def own_name(self, function: str) -> str:
+        """As in Math, with a capital."""
+        return function.capitalize()
+
+    def definition(self, name: str, takes: Sequence[str], lines: Sequence[str], result: str) -> str:
+        """A static method."""
+        words = ", ".join(f"float {a}" for a in takes)
+        return "\n".join([f"static float {name}({words})\n{{", *lines, f"    return {result};\n}}"])
 
     def draw(self) -> str:
         """The next number of an agent's stream."""

@@ -11,8 +11,10 @@ from converters.formats.csharp.text import CS_TYPES, CSharp
 from converters.formats.format import WriteOptions
 from converters.formats.programs.members import Field
 from converters.formats.programs.plan import CLOSE, ROWS, Plan, formula, plan_of
+from converters.graph.ops.loops.layers import box_muller, gumbel
 from converters.graph.printer import Printer
 from converters.policy.policy import Policy
+from signatures.code import CodeOptions
 
 _UNIFORM = """
     /// <summary>The stream of draws, splitmix64: above 0, below 1. The same seed, the same draws as in C.</summary>
@@ -33,8 +35,8 @@ _NORMAL = """
     void Normal(float[] drawn)
     {
         for (int i = 0; i < drawn.Length; i++) {
-            double radius = global::System.Math.Sqrt(-2 * global::System.Math.Log(Uniform()));
-            drawn[i] = (float)(radius * global::System.Math.Cos(6.283185307179586 * Uniform()));
+            float radius = Uniform(), turn = Uniform();
+            drawn[i] = $X;
         }
     }
 """.strip("\n")
@@ -42,13 +44,13 @@ _NORMAL = """
 
 def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
     """The class. Raises UnsupportedOpError."""
-    return {f"{policy.name}.cs": Pieces(_text(plan_of(policy, options)).encode("ascii"))}
+    return {f"{policy.name}.cs": Pieces(_text(plan_of(policy, options), options.code).encode("ascii"))}
 
 
-def _text(plan: Plan) -> str:
+def _text(plan: Plan, code: CodeOptions) -> str:
     header, program = plan.header, plan.program
     name, state = header.class_name, header.state
-    words = CSharp()
+    words = CSharp(code.math == "own")
     printer = Printer(words, "w_", (name, *sorted({f.name for f in (*header.fed, *header.answered)})))
     by_name = {f.spec.name: f for f in header.fed}
     for key, tensor in program.inputs.items():
@@ -90,15 +92,15 @@ def _text(plan: Plan) -> str:
         "    /// <summary>Computes with the noise that stands in its members (zeros: without chance).</summary>\n"
         '    /// <exception cref="System.IndexOutOfRangeException">An observed index lies outside.</exception>\n'
         "    public void Compute()\n    {\n" + "\n".join(body) + "\n    }",
-        *([_choose(plan.chosen, plan.sizes)] if plan.chosen else []),
+        *([_choose(plan.chosen, plan.sizes, printer)] if plan.chosen else []),
         _selftest(plan, words),
         *([_UNIFORM] if draws else []),
-        *([_NORMAL] if header.noise else []),
+        *([_NORMAL.replace("$X", printer.function(box_muller, "radius", "turn"))] if header.noise else []),
     ]
     weights = [words.constant(place, printer.name(place)) for place in program.constants]
     inner = [*(m.rstrip("\n") for m in members), *methods]
     if words.helpers:
-        inner.append("\n".join(f"    {words.helpers[key]}" for key in sorted(words.helpers)))
+        inner += ["\n".join(f"    {line}" for line in h.splitlines()) for h in words.helpers.values()]
     inner += ["\n".join(f"    {line}" for line in w.splitlines()) for w in weights]
     return (
         f"/* {name}: a policy without a runtime, C# 7.3 for .NET Standard 2.0: every Unity since 2018, Godot .NET.\n"
@@ -117,16 +119,16 @@ def _member(field: Field) -> str:
     )
 
 
-def _choose(field: Field, sizes: Sequence[int]) -> str:
+def _choose(field: Field, sizes: Sequence[int], printer: Printer) -> str:
     """The method that draws classes by their log-probabilities, by the Gumbel trick."""
     return (
         f"    static readonly int[] branches = {{ {', '.join(map(str, sizes))} }};\n\n"
         "    /// <summary>Draws a class for each branch.</summary>\n    public void Choose(int[] classes)\n    {\n"
         "        int start = 0;\n        for (int branch = 0; branch < branches.Length; branch++) {\n"
-        "            double best = double.NegativeInfinity;\n            classes[branch] = 0;\n"
+        "            float best = float.NegativeInfinity;\n            classes[branch] = 0;\n"
         "            for (int i = 0; i < branches[branch]; i++) {\n"
-        "                double noise = global::System.Math.Log(-global::System.Math.Log(Uniform()));\n"
-        f"                double drawn = {field.name}[start + i] - noise;\n"
+        "                float u = Uniform();\n"
+        f"                float drawn = {printer.function(gumbel, f'{field.name}[start + i]', 'u')};\n"
         "                if (best < drawn) { best = drawn; classes[branch] = i; }\n            }\n"
         "            start += branches[branch];\n        }\n    }"
     )

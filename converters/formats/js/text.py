@@ -6,8 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from converters.graph.language import Language, bare, lines_of, numbers
 from converters.graph.ops.loops.base import Applied, Element
-from converters.graph.printer import Language, bare, lines_of, numbers
+from converters.graph.ops.loops.own_math import OWN
 from converters.graph.program import Place, every
 from converters.graph.types import BOOL, FLOAT32, INT32, INT64
 
@@ -15,6 +16,12 @@ from converters.graph.types import BOOL, FLOAT32, INT32, INT64
 JS_ARRAYS = {"float32": "Float32Array", "int32": "Int32Array", "int64": "Float64Array", "bool": "Uint8Array"}
 _SAME = ("exp", "expm1", "log", "log1p", "sqrt", "sin", "cos", "tan", "tanh", "floor", "ceil")
 _PLAIN = {"max": "Math.max", "min": "Math.min", "abs": "Math.abs"}
+#: Functions of a number's bits.
+_RAW = {
+    "bits": "function bits(a) {\n    word[0] = a;\n    return wordBits[0];\n}",
+    "of_bits": "function of_bits(a) {\n    wordBits[0] = a;\n    return word[0];\n}",
+}
+_WORD = "const word = new Float32Array(1), wordBits = new Int32Array(word.buffer);"
 #: Functions that a module brings along.
 _HELPERS = {
     "mod": "function mod(a, b) { const r = a % b; return r !== 0 && r < 0 !== b < 0 ? r + b : r; }",
@@ -80,23 +87,33 @@ class JavaScript(Language):
 
     def helper(self, function: str, operands: Sequence[str], dtype: np.dtype) -> str:
         """A call of a function that the module brings along, or that ``Math`` has."""
-        if function not in _PLAIN:
+        if function in _RAW:
+            self.helpers |= {"word": _WORD, function: _RAW[function]}
+        elif function not in _PLAIN:
             self.helpers[function] = _HELPERS[function]
         text = f"{_PLAIN.get(function, function)}({', '.join(bare(o) for o in operands)})"
         return f"fround({text})" if function in ("mod", "intdiv") and dtype == FLOAT32 else text
+
+    def own_name(self, function: str) -> str:
+        """As in Math; no member is called so."""
+        return f"_{function}"
+
+    def definition(self, name: str, takes: Sequence[str], lines: Sequence[str], result: str) -> str:
+        """A function."""
+        return "\n".join([f"function {name}({', '.join(takes)}) {{", *lines, f"    return {result};\n}}"])
 
     def draw(self) -> str:
         """The next number of an agent's stream."""
         return "this.uniform()"
 
-    def rounded(self, text: str, x: Applied) -> str:
+    def round_to(self, text: str, x: Applied) -> str:
         """A float32, by ``Math.fround``."""
         return f"fround({bare(text)})" if x.dtype == FLOAT32 else text
 
     def applied(self, x: Applied, operands: Sequence[str]) -> str:
         """A function of operands; sums of int32 wrap as C's do, indices need not."""
         for name in ("erf", "rint"):
-            if x.function == name:
+            if x.function == name and not (self.own and name in OWN):
                 self.helpers[name] = _HELPERS[name]
         if x.function == "equal":
             return f"({operands[0]} {'==' if x.operands[0].dtype == BOOL else '==='} {operands[1]})"

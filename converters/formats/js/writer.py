@@ -12,8 +12,10 @@ from converters.formats.format import WriteOptions
 from converters.formats.js.text import JS_ARRAYS, JavaScript
 from converters.formats.programs.members import Field
 from converters.formats.programs.plan import CLOSE, ROWS, Plan, formula, plan_of
+from converters.graph.ops.loops.layers import box_muller, gumbel
 from converters.graph.printer import Printer
 from converters.policy.policy import Policy
+from signatures.code import CodeOptions
 
 _UNIFORM = """
     /** The stream of draws, splitmix64: above 0, below 1. The same seed gives the same draws as in C and C#. */
@@ -30,8 +32,8 @@ _NORMAL = """
     /** Draws from N(0, 1), by Box and Muller. */
     normal(out) {
         for (let i = 0; i < out.length; i++) {
-            const radius = Math.sqrt(-2 * Math.log(this.uniform()));
-            out[i] = radius * Math.cos(6.283185307179586 * this.uniform());
+            const radius = this.uniform(), turn = this.uniform();
+            out[i] = $X;
         }
     }
 """.strip("\n")
@@ -39,13 +41,14 @@ _NORMAL = """
 
 def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
     """The module. Raises UnsupportedOpError."""
-    return {f"{policy.name}.mjs": Pieces(_text(policy.name, plan_of(policy, options)).encode("ascii"))}
+    text = _text(policy.name, plan_of(policy, options), options.code)
+    return {f"{policy.name}.mjs": Pieces(text.encode("ascii"))}
 
 
-def _text(name: str, plan: Plan) -> str:
+def _text(name: str, plan: Plan, code: CodeOptions) -> str:
     header, program = plan.header, plan.program
     taken = ("fround", header.class_name, *sorted({f.name for f in (*header.fed, *header.answered)}))
-    words = JavaScript()
+    words = JavaScript(code.math == "own")
     printer = Printer(words, "w_", taken)
     by_name = {f.spec.name: f.name for f in header.fed}
     for key, tensor in program.inputs.items():
@@ -77,10 +80,10 @@ def _text(name: str, plan: Plan) -> str:
         "     *  Throws a RangeError where an observed index lies outside of its table. */\n    compute() {\n"
         + "\n".join(body)
         + "\n    }",
-        *([_choose(plan.chosen, plan.sizes)] if plan.chosen else []),
+        *([_choose(plan.chosen, plan.sizes, printer)] if plan.chosen else []),
         _selftest(plan, words),
         *([_UNIFORM] if draws else []),
-        *([_NORMAL] if header.noise else []),
+        *([_NORMAL.replace("$X", printer.function(box_muller, "radius", "turn"))] if header.noise else []),
     ]
     ports = {
         kind: {f.spec.name: [f.name, f.spec.dtype, list(f.spec.shape)] for f in some}
@@ -93,7 +96,7 @@ def _text(name: str, plan: Plan) -> str:
         f"   Made by export-model.\n\n{plan.contract}",
         "const { fround } = Math;",
         *(words.constant(place, printer.name(place)) for place in program.constants),
-        *(words.helpers[key] for key in sorted(words.helpers)),
+        *words.helpers.values(),
         f"/** One agent: what it observes, keeps and does are its members, arrays that live as long as it. */\n"
         f"export class {header.class_name} {{\n" + "\n\n".join(methods) + "\n}",
         "/** Names of the contract: [member, dtype, shape]; the state's member, and the name of its next value. */\n"
@@ -109,14 +112,15 @@ def _member(field: Field) -> str:
     return f"        this.{field.name} = new {JS_ARRAYS[field.spec.dtype]}({field.size}); // {about}\n"
 
 
-def _choose(field: Field, sizes: Sequence[int]) -> str:
+def _choose(field: Field, sizes: Sequence[int], printer: Printer) -> str:
     """The method that draws classes by their log-probabilities, by the Gumbel trick."""
     return (
         "    /** Draws a class for each branch. */\n    choose(action) {\n"
         f"        let start = 0;\n        [{', '.join(map(str, sizes))}].forEach((size, branch) => {{\n"
         "            let best = -Infinity;\n            action[branch] = 0;\n"
         "            for (let i = 0; i < size; i++) {\n"
-        f"                const drawn = this.{field.name}[start + i] - Math.log(-Math.log(this.uniform()));\n"
+        f"                const u = this.uniform();\n"
+        f"                const drawn = {printer.function(gumbel, f'this.{field.name}[start + i]', 'u')};\n"
         "                if (best < drawn) { best = drawn; action[branch] = i; }\n            }\n"
         "            start += size;\n        });\n        return action;\n    }"
     )

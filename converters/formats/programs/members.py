@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from converters.graph.language import identifier
 from converters.graph.nodes import NameScope
-from converters.graph.printer import identifier
 from signatures.records import dataclass
 from signatures.roles import Role
 from signatures.spec import PolicySignature, TensorSpec

@@ -23,6 +23,7 @@ FUNCTIONS = frozenset(
         *("add", "sub", "mul", "div", "neg", "abs", "floor", "ceil", "rint", "min", "max", "pow", "mod", "intdiv"),
         *("exp", "expm1", "log", "log1p", "sqrt", "sin", "cos", "tan", "tanh", "erf"),
         *("less", "less_equal", "equal", "and", "or", "not", "select", "cast"),
+        *("bits", "of_bits"),  # an int32 of the bits of a float32, and back
         "within",  # an index, and how many there are: the program answers nothing where it lies outside
     )
 )
@@ -97,7 +98,15 @@ class Drawn:
     dtype: np.dtype = FLOAT32
 
 
-Expression = Number | Counter | Element | Applied | Reduced | Drawn
+@dataclass(frozen=True, eq=False, slots=True)
+class Given:
+    """A parameter of a function that a program brings along."""
+
+    name: str
+    dtype: np.dtype = FLOAT32
+
+
+Expression = Number | Counter | Element | Applied | Reduced | Drawn | Given
 Index = Sequence[Expression]
 
 

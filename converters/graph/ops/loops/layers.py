@@ -242,14 +242,24 @@ def uniform(node: Node, builder: LoopBuilder) -> Tensor:
     return builder.compute(shape_of(node, builder), lambda at: Drawn(), builder.type_of(node.name).dtype)
 
 
+def box_muller(radius: Expression, turn: Expression) -> Expression:
+    """A draw from N(0, 1), of two that are uniform."""
+    length = apply("sqrt", _mul(Number(-2, radius.dtype), apply("log", radius)))
+    return _mul(length, apply("cos", _mul(Number(2 * np.pi, turn.dtype), turn)))
+
+
+def gumbel(logit: Expression, drawn: Expression) -> Expression:
+    """A logit less log(-log u): the largest of a row is drawn by the probabilities of the row."""
+    return apply("sub", logit, apply("log", apply("neg", apply("log", drawn))))
+
+
 def normal(node: Node, builder: LoopBuilder) -> Tensor:
     """Draws by Box and Muller's transform."""
     shape, dtype = shape_of(node, builder), builder.type_of(node.name).dtype
     radius, turn = (builder.compute(shape, lambda at: Drawn(), dtype) for _ in range(2))
 
     def one(at: Index) -> Expression:
-        length = apply("sqrt", _mul(Number(-2, dtype), apply("log", Element(radius, tuple(at)))))
-        return _mul(length, apply("cos", _mul(Number(2 * np.pi, dtype), Element(turn, tuple(at)))))
+        return box_muller(Element(radius, tuple(at)), Element(turn, tuple(at)))
 
     return builder.compute(shape, one, dtype)
 
@@ -288,8 +298,7 @@ def multinomial(node: Node, builder: LoopBuilder) -> Tensor:
 
     def one(at: Index) -> Expression:
         def noisy(k: Index) -> Expression:
-            noise = apply("log", apply("neg", apply("log", Element(draws, (*at, k[0])))))
-            return apply("sub", Element(x, (at[0], k[0])), noise)
+            return gumbel(Element(x, (at[0], k[0])), Element(draws, (*at, k[0])))
 
         found = builder.reduce("first largest", [x.shape[1]], noisy, INT32)
         return found if dtype == INT32 else apply("cast", found, dtype=dtype)

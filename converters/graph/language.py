@@ -1,0 +1,136 @@
+"""What a programming language is to the printer: its words for numbers, functions and loops, and what all share."""
+
+from __future__ import annotations
+
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from converters.graph.ops.loops.base import Applied, Number
+from converters.graph.ops.loops.own_math import OWN
+from converters.graph.types import FLOAT32
+
+_WORDS = re.compile(r"[^0-9A-Za-z]+")
+_INFIX = {
+    "add": "+",
+    "sub": "-",
+    "mul": "*",
+    "div": "/",
+    "less": "<",
+    "less_equal": "<=",
+    "equal": "==",
+    "and": "&&",
+    "or": "||",
+}
+_PER_LINE = 12
+
+
+def identifier(name: str) -> str:
+    """A name as languages take it, without a letter or digit in front."""
+    return _WORDS.sub("_", name).strip("_") or "x"
+
+
+def comment(text: str) -> str:
+    """Return a text as a comment that it cannot leave: a source's names are untrusted.
+
+    A ``*`` and a ``/`` on two lines end a comment, too, where a backslash, or C99's ``??/`` for it, joins the lines.
+    """
+    safe = re.sub(r"[^ -~]|[\\?]", "_", text).replace("*/", "* /").replace("/*", "/ *")
+    return f"/* {safe} */"
+
+
+def numbers(value: np.ndarray, one: str = "{}f") -> list[str]:
+    """The finite float32 elements of an array as text that reads back to the same bits; ``one`` is around each."""
+    words = (f"{x:.9g}" for x in value.reshape(-1).tolist())
+    return [one.format(w if "." in w or "e" in w else f"{w}.0") for w in words]
+
+
+def lines_of(words: Sequence[str]) -> str:
+    """Numbers of an array, twelve on a line."""
+    rows = (", ".join(words[i : i + _PER_LINE]) for i in range(0, len(words), _PER_LINE))
+    return ",\n    ".join(rows)
+
+
+class Language(ABC):
+    """The words of a programming language; ``helpers`` are the functions that a program brings along, by name, each
+    after those that it calls. ``own``: mathematical functions are ours, and every result is rounded to its dtype.
+    """
+
+    #: Function of float32 → how it is written; ``{0}`` and ``{1}`` are the operands.
+    functions: Mapping[str, str] = {}
+
+    def __init__(self, own: bool = False) -> None:
+        self.helpers: dict[str, str] = {}
+        self.own = own
+
+    @abstractmethod
+    def literal(self, value: float, dtype: np.dtype) -> str:
+        """A number, to the last bit."""
+
+    @abstractmethod
+    def declaration(self, dtype: np.dtype, name: str, value: str, *, constant: bool) -> str:
+        """A local variable."""
+
+    @abstractmethod
+    def loop(self, name: str, first: int, last: int, step: int) -> str:
+        """The head of a loop."""
+
+    @abstractmethod
+    def cast(self, text: str, source: np.dtype, target: np.dtype) -> str:
+        """A number of another dtype."""
+
+    @abstractmethod
+    def helper(self, function: str, operands: Sequence[str], dtype: np.dtype) -> str:
+        """A call of a function that the program brings along."""
+
+    @abstractmethod
+    def own_name(self, function: str) -> str:
+        """What a mathematical function of ours is called."""
+
+    @abstractmethod
+    def definition(self, name: str, takes: Sequence[str], lines: Sequence[str], result: str) -> str:
+        """The definition of a function of float32: its statements, and what it gives."""
+
+    @abstractmethod
+    def draw(self) -> str:
+        """The next number of the stream of draws."""
+
+    def round_to(self, text: str, x: Applied) -> str:
+        """What an operator gives, in the precision of its dtype."""
+        return text
+
+    def applied(self, x: Applied, operands: Sequence[str]) -> str:
+        """A function of operands."""
+        function = x.function
+        if self.own and function in OWN:
+            return f"{self.own_name(function)}({', '.join(map(bare, operands))})"
+        if function in _INFIX:
+            return self.round_to(f"({operands[0]} {_INFIX[function]} {operands[1]})", x)
+        if function == "select" and isinstance(x.operands[0], Number):
+            return operands[1 if x.operands[0].value else 2]
+        if function == "select":
+            return f"({operands[0]} ? {operands[1]} : {operands[2]})"
+        if function == "cast":
+            return self.cast(operands[0], x.operands[0].dtype, x.dtype)
+        if function in ("neg", "not"):
+            return f"({'-' if function == 'neg' else '!'}{operands[0]})"
+        if function not in self.functions:
+            return self.helper(function, operands, x.dtype)
+        if x.dtype == FLOAT32:
+            return self.round_to(self.functions[function].format(*operands), x)
+        wide = [self.cast(o, x.dtype, np.dtype(np.float32)) for o in operands]  # whole numbers are whole
+        return self.cast(self.functions[function].format(*wide), np.dtype(np.float32), x.dtype)
+
+
+def bare(text: str) -> str:
+    """Without the parentheses around all of it."""
+    if not (text.startswith("(") and text.endswith(")")):
+        return text
+    depth = 0
+    for i, c in enumerate(text):
+        depth += {"(": 1, ")": -1}.get(c, 0)
+        if depth == 0 and i < len(text) - 1:
+            return text
+    return text[1:-1]

@@ -1,0 +1,99 @@
+"""``python -m tests.bench.own_math``: how far the functions of ``--math own`` are off, over all 2^32 floats (20 min).
+
+Beside the C library in double, compiled by gcc; units in the last place of the true value, a float's least spacing
+below the least normal number. ``pow`` takes two numbers: its bases go over all floats, its exponents over some.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from converters.formats.c.text import C
+from converters.graph.ops.loops.base import Applied, Given
+from converters.graph.ops.loops.own_math import OWN
+from converters.graph.printer import Printer
+from converters.graph.types import FLOAT32
+from converters.runtimes.c import compiler
+
+#: What is left out for a function: where its entry says so.
+_WHERE = {
+    "angles below 8192": "fabs(x) < 8192.0",
+    "results from 1e-30 to 1e30": "(right != right || (fabs(right) > 1e-30 && fabs(right) < 1e30))",
+    "all floats": "1",
+}
+_MAIN = """
+#include <stdio.h>
+#include <stdlib.h>
+int main(int count, char **words)
+{
+    const uint64_t step = strtoull(words[1], 0, 10);
+    static const float exponents[] = {-3.0f, -1.5f, -1.0f, 0.3f, 0.5f, 1.0f, 2.0f, 2.2f, 3.0f, 7.0f};
+    double most = 0.0;
+    float where = 0.0f;
+    (void)count;
+    for (uint64_t i = 0; i < (UINT64_C(1) << 32); i += step) {
+        const uint32_t bits = (uint32_t)i;
+        float a;
+        memcpy(&a, &bits, sizeof a);
+        const double x = (double)a;
+        const float b = exponents[i / step % 10];
+        double right = CALLED(x, (double)b);
+        const float found = OWN(a, b);
+        if (!(KEPT)) continue;
+        if ((right != right) != (found != found)) { printf("%.9g %.9g\\n", 1e30, x); return 0; }
+        if (right != right) continue;
+        if (fabs(right) > 0x1p128) right = right < 0 ? -0x1p128 : 0x1p128;
+        const double given = isinf(found) ? (found < 0 ? -0x1p128 : 0x1p128) : (double)found;
+        int exponent;
+        frexp(right, &exponent);
+        if (exponent > 128) exponent = 128;
+        const int least = exponent - 24 < -149 || right == 0.0 ? -149 : exponent - 24;
+        const double off = fabs(given - right) / ldexp(1.0, least);
+        if (off > most) { most = off; where = a; }
+    }
+    printf("%.9g %.9g\\n", most, (double)where);
+    return 0;
+}
+"""
+
+
+def source_of(function: str) -> str:
+    """C that measures a function of ours."""
+    words = C("own", own=True)
+    given = [Given("a"), Given("b")][: 2 if function == "pow" else 1]
+    Printer(words, "").function(lambda *x: Applied(function, x, FLOAT32), *(g.name for g in given))
+    names = "(a)" if len(given) == 1 else "(a, b)"
+    macros = {
+        "KEPT": _WHERE[OWN[function].where],
+        "OWN(a, b)": f"own_{function}f{names}",
+        "CALLED(a, b)": f"{function}{names}",
+    }
+    defined = "".join(f"#define {name} {text}\n" for name, text in macros.items())
+    head = "#include <math.h>\n#include <stdint.h>\n#include <string.h>\n"
+    return head + "\n".join(words.helpers.values()) + "\n" + defined + _MAIN
+
+
+def measure(function: str, step: int, folder: Path) -> tuple[float, float]:
+    """How many units one of each ``step`` floats is off at most, and which."""
+    (folder / f"{function}.c").write_text(source_of(function), "ascii")
+    command = [str(compiler()), "-std=c99", "-O2", "-ffp-contract=off", "-o", function, f"{function}.c", "-lm"]
+    subprocess.run(command, check=True, cwd=folder)
+    said = subprocess.run([str(folder / function), str(step)], check=True, capture_output=True, text=True).stdout
+    most, where = said.split()
+    return float(most), float(where)
+
+
+def main(step: int) -> int:
+    """Print the table."""
+    with tempfile.TemporaryDirectory() as scratch:
+        for function, own in OWN.items():
+            most, where = measure(function, step, Path(scratch))
+            print(f"{function:6} {most:8.3f} at {where:<16.9g} promised {own.ulps:g} of {own.where}", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(int(sys.argv[1]) if len(sys.argv) > 1 else 1))
