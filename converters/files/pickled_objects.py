@@ -115,7 +115,8 @@ class _Objects(Machine):
         return self.instance(function, arguments)
 
     def instance(self, maker: Any, arguments: Any) -> Instance:
-        """Return an object that is not made."""
+        """Return an object that is not made. A class may be one that the pickle describes (cloudpickle does)."""
+        maker = maker.maker if isinstance(maker, Instance) else maker
         if not isinstance(maker, Name) or not isinstance(arguments, tuple):
             raise damaged_error("its pickle makes an object of something that is not a class")
         if (maker.module, maker.name) in _RECONSTRUCTORS and arguments and isinstance(arguments[0], Name):

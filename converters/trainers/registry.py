@@ -16,13 +16,13 @@ ROOMS = (
     "mlagents",
     "rsl_rl",
     "rl_games",
+    "skrl",
     "cleanrl",
 )
 TRAINERS: tuple[Trainer, ...] = tuple(importlib.import_module(f"converters.trainers.{room}").TRAINER for room in ROOMS)
-#: How a tensor's name begins in the checkpoints of trainers whose networks are not rebuilt (rl_games 1.6, skrl 2,
-#: Tianshou 2, RLlib 2, Sample Factory 2).
+#: How a tensor's name begins in the checkpoints of trainers whose networks are not rebuilt (Tianshou 2, RLlib 2,
+#: Sample Factory 2).
 _OTHERS: Mapping[str, str] = {
-    **dict.fromkeys(("log_std_parameter", "policy_layer.", "net_container.", "state_preprocessor"), "skrl"),
     **dict.fromkeys(("actor.preprocess.", "model.model.model."), "Tianshou"),
     **dict.fromkeys(("encoder.actor_encoder.", "_logits._model.", "_hidden_layers.0._model."), "RLlib"),
     "action_parameterization.": "Sample Factory",

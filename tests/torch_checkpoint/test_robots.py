@@ -21,8 +21,8 @@ from signatures.roles import Role
 from tests.commands import export_model
 from tests.torch_checkpoint.pt_files import Writer
 
-NAMES = sorted(p.stem for p in FOLDER.glob("rl_games_*.npz"))
-SENSORS = {"rl_games_cnn_plain": ((2, 16, 12),)}
+NAMES = sorted(p.stem for p in FOLDER.glob("*.npz"))
+SENSORS = {"rl_games_cnn_plain": ((2, 16, 12),), "skrl_ppo_eye": ((2, 14, 12),)}
 
 
 def states(name: str) -> dict[str, dict[str, np.ndarray]]:

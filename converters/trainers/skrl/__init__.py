@@ -1,0 +1,47 @@
+"""Checkpoints of skrl (``checkpoints/agent_<n>.pt``; Isaac Lab), with the ``agent.yaml`` of their run.
+
+Source: skrl/agents/torch/base.py (``write_checkpoint``), utils/runner/torch/runner.py, utils/model_instantiators/torch
+and resources/preprocessors/torch of 1.4 and 2.1. ``{"policy": state, "value": state, "observation_preprocessor": …}``;
+up to 1.4 the observations were called states, and so their preprocessor.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from converters.trainers.settings import find_settings
+from converters.trainers.skrl.policy import PREPROCESSORS, rebuild_policy
+from converters.trainers.trainer import Rebuilt, Saved, Trainer
+from signatures.errors import SourceError
+
+_FILES = ("params/agent.yaml", "agent.yaml")
+
+
+def _policy_of(saved: Saved) -> dict[Any, Any] | None:
+    """Return the policy's state dictionary; None where the checkpoint is not of skrl."""
+    value = saved.value
+    state = value.get("policy") if isinstance(value, dict) else None
+    if not isinstance(state, dict):
+        return None
+    generated = any(isinstance(name, str) and "_container." in name for name in state)
+    beside = any(key in value for key in PREPROCESSORS)
+    return state if generated or beside or "log_std_parameter" in state else None
+
+
+def _rebuild(saved: Saved, state: dict[Any, Any]) -> Rebuilt:
+    saved.refuse_activation("a checkpoint of skrl", "its agent.yaml has each of them")
+    found = find_settings(saved.given, _FILES, ("models",))
+    if found is None:
+        raise SourceError(
+            "its agent.yaml is missing",
+            why="a checkpoint of skrl has weights; which layers and activations they belong to stands in the settings "
+            "of its run (models), and none of these files is here: " + ", ".join(_FILES),
+            fix="put the run's params/agent.yaml next to the checkpoint; a model that is a class of its own "
+            "is exported there (torch.onnx.export), and the .onnx given",
+        )
+    settings, file = found
+    graph, facts = rebuild_policy(saved, state, settings)
+    return Rebuilt(graph, facts, (file,))
+
+
+TRAINER = Trainer("skrl", _policy_of, _rebuild)
