@@ -30,6 +30,7 @@ _PLAIN_TYPES = frozenset(
         *("list", "tuple", "dict", "int", "float", "bool", "str", "bytes"),
     )
 )
+_BUILTINS = frozenset(("builtins", "__builtin__"))
 #: What protocols 0 and 1 make an object of a class with (Lib/copyreg.py).
 _RECONSTRUCTORS = (("copy_reg", "_reconstructor"), ("copyreg", "_reconstructor"))
 _MULTIARRAY = ("numpy.core.multiarray", "numpy._core.multiarray")
@@ -68,13 +69,18 @@ def unpickle_objects(
     data: bytes,
     storage: Callable[[tuple[Any, ...]], Any] | None = None,
     names: Mapping[tuple[str, str], Any] | None = None,
+    *,
+    functions: bool = False,
 ) -> Any:
     """Return the value of a pickle that may hold objects. ``storage`` makes what a persistent id stands for; ``names``
-    are functions of this program, for names that the pickle calls.
+    are functions of this program, for names that the pickle calls. ``functions``: it may describe functions (as
+    cloudpickle does), whose code names builtins; they stay names, as all others.
 
     Raises NotAPolicyError for a name that acts on the machine, DamagedFileError for what breaks the rules of pickles.
     """
-    return carry_out(_Objects(storage or _no_storage, names or {}, 4 * len(data) + (1 << 16)), io.BytesIO(data))
+    machine = _Objects(storage or _no_storage, names or {}, 4 * len(data) + (1 << 16))
+    machine.refused_modules = SYSTEM - _BUILTINS if functions else SYSTEM
+    return carry_out(machine, io.BytesIO(data))
 
 
 def _no_storage(identity: tuple[Any, ...]) -> Any:
@@ -94,6 +100,7 @@ class _Objects(Machine):
         self._names = {**NAMES, **names}
         self.opcodes = _OPCODES
         self._most_copied = most_copied
+        self.refused_modules = SYSTEM
 
     def import_name(self, module: str, name: str) -> Any:
         """Return what is known of an imported name. Raises NotAPolicyError for one that acts on the machine."""
@@ -102,7 +109,7 @@ class _Objects(Machine):
         if (module, name) == ("_codecs", "encode"):
             return Function("encode", self._encode_text)
         root = module.partition(".")[0]
-        if root in SYSTEM and not (root in ("builtins", "__builtin__") and name in _PLAIN_TYPES):
+        if root in self.refused_modules and not (root in _BUILTINS and name in _PLAIN_TYPES):
             raise refusal(module, name)
         return Name(module, name)
 

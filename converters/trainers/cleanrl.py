@@ -12,14 +12,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from converters.files.torch_archive import Archive
 from converters.graph.nn.activations import Activation
 from converters.graph.nn.normalisation import layer
 from converters.graph.nodes import Graph
 from converters.policy.facts import SourceFacts
 from converters.trainers.pytorch.activations import activation_of
 from converters.trainers.pytorch.network import Network
-from converters.trainers.pytorch.weights import Weights, pytorch_alone
+from converters.trainers.pytorch.weights import TensorFile, Weights, pytorch_alone
 from converters.trainers.rsl_rl import per_action
 from converters.trainers.trainer import Rebuilt, Saved, Trainer
 from signatures.errors import SourceError, UsageError
@@ -82,7 +81,11 @@ def _state_of(value: Any) -> tuple[Mapping[Any, Any], _Script] | None:
 
 
 def _to_graph(
-    archive: Archive, state: Mapping[Any, Any], script: _Script, activation: Activation, told: Sequence[tuple[int, ...]]
+    archive: TensorFile,
+    state: Mapping[Any, Any],
+    script: _Script,
+    activation: Activation,
+    told: Sequence[tuple[int, ...]],
 ) -> tuple[Graph, SourceFacts]:
     """The policy and what is known of it; ``told`` says the image's shape, where there is one.
 

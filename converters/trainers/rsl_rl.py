@@ -13,14 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from converters.files.torch_archive import Archive
 from converters.graph.nn.activations import Activation
 from converters.graph.nodes import Graph
 from converters.graph.types import FLOAT32
 from converters.policy.facts import SourceFacts
 from converters.trainers.pytorch.activations import activation_of
 from converters.trainers.pytorch.network import Network
-from converters.trainers.pytorch.weights import Weights, pytorch_alone
+from converters.trainers.pytorch.weights import TensorFile, Weights, pytorch_alone
 from converters.trainers.trainer import Rebuilt, Saved, Trainer
 from signatures.records import dataclass
 from signatures.roles import Role
@@ -63,7 +62,7 @@ def _layout_of(value: Any) -> _Layout | None:
     return None
 
 
-def _to_graph(archive: Archive, layout: _Layout, activation: Activation) -> tuple[Graph, SourceFacts]:
+def _to_graph(archive: TensorFile, layout: _Layout, activation: Activation) -> tuple[Graph, SourceFacts]:
     """The policy and what is known of it. Raises SourceError for parts that are not known, DamagedFileError."""
     state: Mapping[Any, Any] = archive.value[layout.key]
     beside = archive.value.get("obs_norm_state_dict")

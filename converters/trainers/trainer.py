@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from converters.files.fetch import Fetched
-from converters.files.torch_archive import Archive
 from converters.graph.nodes import Graph
 from converters.policy.facts import SourceFacts
+from converters.trainers.pytorch.weights import TensorFile
 from signatures.errors import UsageError
 from signatures.records import dataclass
 
@@ -21,14 +21,14 @@ from signatures.records import dataclass
 class Saved:
     """What was saved, and what the user says of it.
 
-    ``archive`` is PyTorch's file; ``settings`` what the trainer wrote beside it in the same source (None: nothing).
-    ``sensors`` are the shapes of what is observed, ``goals`` the places of those that are goals, ``activation`` the one
-    between layers: what weights do not tell. ``statistics`` is a file that observations were normalised by, beside the
-    weights: its name and its bytes.
+    ``archive`` is the file with the tensors; ``settings`` what the trainer wrote beside it in the same source (None:
+    nothing). ``sensors`` are the shapes of what is observed, ``goals`` the places of those that are goals,
+    ``activation`` the one between layers: what weights do not tell. ``statistics`` is a file that observations were
+    normalised by, beside the weights: its name and its bytes.
     """
 
     given: Fetched
-    archive: Archive
+    archive: TensorFile
     settings: Mapping[str, Any] | None = None
     sensors: tuple[tuple[int, ...], ...] = ()
     goals: tuple[int, ...] = ()

@@ -218,7 +218,7 @@ def saved_model(files: Files, random: Random) -> Files:
     return {**files, "saved_model.pb": mutation.protobuf(files["saved_model.pb"], random, schema.SavedModel.FromString)}
 
 
-def _opcodes(pickle: bytes) -> list[bytes]:
+def opcodes(pickle: bytes) -> list[bytes]:
     """A pickle cut into its opcodes."""
     starts = [at for _, _, at in pickletools.genops(pickle) if at is not None]
     return [pickle[a:b] for a, b in zip(starts, [*starts[1:], len(pickle)], strict=True)]
@@ -233,7 +233,7 @@ _CODES = (
 )
 
 
-def _opcode(part: bytes, random: Random) -> bytes:
+def opcode(part: bytes, random: Random) -> bytes:
     if len(part) > 1 and random.random() < 0.4:
         return part[:1] + mutation.damaged(part[1:], random)
     return random.choice(_CODES) + (part if random.random() < 0.5 else b"")
@@ -245,12 +245,12 @@ def pickled(files: Files, random: Random) -> Files:
         if data.startswith(b"PK"):
             return {"policy.pt": mutation.damaged(data, random)}
         first = data[: pickled_end(data)]
-        return {"policy.pt": mutation.parts(_opcodes_of_row(first), random, _opcode) + data[len(first) :]}
+        return {"policy.pt": mutation.parts(_opcodes_of_row(first), random, opcode) + data[len(first) :]}
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         entries = {e.filename: archive.read(e) for e in archive.infolist()}
     name = next(n for n in entries if n.endswith("data.pkl"))
     if random.random() < 0.9:
-        entries[name] = mutation.parts(_opcodes(entries[name]), random, _opcode)
+        entries[name] = mutation.parts(opcodes(entries[name]), random, opcode)
     else:
         other = random.choice(sorted(entries))
         content = entries.pop(other)
@@ -272,7 +272,7 @@ def _opcodes_of_row(data: bytes) -> list[bytes]:
     while stream.tell() < len(data):
         begin = stream.tell()
         list(pickletools.genops(stream))
-        found += _opcodes(data[begin : stream.tell()])
+        found += opcodes(data[begin : stream.tell()])
     return found
 
 
@@ -302,7 +302,7 @@ def script(files: Files, random: Random) -> Files:
     if draw < 0.65:
         content = _code(content.decode(), random).encode("utf-8", "surrogatepass")
     elif draw < 0.9:
-        content = mutation.parts(_opcodes(content), random, _opcode)
+        content = mutation.parts(opcodes(content), random, opcode)
     else:
         content = mutation.damaged(content, random)
     kept[at] = name, method, content
@@ -357,9 +357,7 @@ def _code(text: str, random: Random) -> str:
 def statistics(files: Files, random: Random) -> Files:
     """The pickle beside a saved model changed; the model itself stays."""
     data = files["vecnormalize.pkl"]
-    changed = (
-        mutation.damaged(data, random) if random.random() < 0.1 else mutation.parts(_opcodes(data), random, _opcode)
-    )
+    changed = mutation.damaged(data, random) if random.random() < 0.1 else mutation.parts(opcodes(data), random, opcode)
     return {**files, "vecnormalize.pkl": changed}
 
 

@@ -24,7 +24,7 @@ from fixtures import FOLDER, path
 from signatures.errors import ExportModelError
 from tests.checkpoint.writing import bundle as write_checkpoint
 from tests.checkpoint.writing import policy as training_policy
-from tests.fuzz import changes
+from tests.fuzz import changes, robots
 from tests.fuzz.changes import Files
 from tests.handmade import constant, continuous_policy, graph_bytes, graph_def, node, sampled_policy
 from tests.hostile import test_keras_config, zoo
@@ -282,6 +282,8 @@ def _tables() -> Iterator[tuple[str, Reader]]:
     yield "TensorFlow.js", Reader(lambda: _artefacts("tfjs/", ""), changes.tfjs)
     yield "layers model", Reader(_web_layers, changes.tfjs)
     yield "Stable-Baselines3", Reader(_saved_zips, changes.saved_zip, "policy.zip")
+    yield "robots' runs", Reader(robots.runs, robots.change_run, "policy.pt")
+    yield "SBX", Reader(robots.saved_policies, robots.change_saved_policy, "policy.zip")
     yield "VecNormalize", Reader(_normalised, changes.statistics, "policy.zip")
     yield "bundle", Reader(_bundles, changes.bundle, takes="bundle")
     yield "Keras", Reader(_keras, changes.keras_config, "policy.keras", takes="configuration")

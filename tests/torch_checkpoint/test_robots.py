@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import base64
 import json
+import os
+import pickle
+import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,41 +20,14 @@ from converters.graph.run import run_graph
 from exporter.export.sources import read_source
 from fixtures.goldens import read_npz
 from fixtures.robots import FOLDER, ROWS, STEPS
-from fixtures.torch_checkpoint.cases import waves
 from signatures.errors import SourceError, UsageError
 from signatures.roles import Role
 from tests.commands import export_model
 from tests.torch_checkpoint.pt_files import Writer
+from tests.torch_checkpoint.robots import checkpoint, states
 
 NAMES = sorted(p.stem for p in FOLDER.glob("*.npz"))
 SENSORS = {"rl_games_cnn_plain": ((2, 16, 12),), "skrl_ppo_eye": ((2, 14, 12),)}
-
-
-def states(name: str) -> dict[str, dict[str, np.ndarray]]:
-    """The checkpoint's state dictionaries by key."""
-    return {
-        key: {
-            n: np.array(e["values"], e["dtype"]).reshape(e["shape"])
-            if "values" in e
-            else waves(n, e["shape"]).astype(e["dtype"])
-            for n, e in layout.items()
-        }
-        for key, layout in json.loads((FOLDER / f"{name}.json").read_text()).items()
-    }
-
-
-def checkpoint(
-    folder: Path, name: str, place: str = "run/nn/last.pth", settings: str = "run/params/agent.yaml"
-) -> Path:
-    """The checkpoint and its settings, laid out as Isaac Lab does."""
-    writer = Writer()
-    path = folder / place
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(writer.zip({**{k: writer.state(s) for k, s in states(name).items()}, "epoch": 3, "frame": 9}))
-    if settings:
-        (folder / settings).parent.mkdir(parents=True, exist_ok=True)
-        (folder / settings).write_bytes((FOLDER / f"{name}.yaml").read_bytes())
-    return path
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -60,11 +38,12 @@ def test_acts_as_the_trainers_own_player(name: str, tmp_path: Path) -> None:
     inputs = {spec.role: spec for spec in policy.signature.inputs}
     outputs = {spec.role: spec.name for spec in policy.signature.outputs}
     names = [spec.name for spec in policy.signature.outputs]
-    act = "action" if policy.signature.action_space == "continuous" else "deterministic_action"
+    act = "deterministic_action" if "deterministic_action" in names else "action"
     memory = inputs.get(Role.MEMORY_IN)
     state = None if memory is None else np.zeros((ROWS, *memory.shape[1:]), np.float32)
     for step in range(STEPS):
         feeds = {s.name: golden["in/obs"][step] for r, s in inputs.items() if r in (Role.VECTOR, Role.VISUAL)}
+        feeds |= {s.name: np.zeros((ROWS, *s.shape[1:]), np.float32) for r, s in inputs.items() if r is Role.NOISE}
         if Role.MASKS in inputs:
             feeds[inputs[Role.MASKS].name] = golden["in/action_masks"][step]
         if memory is not None:
@@ -159,3 +138,125 @@ def test_is_exported_and_verified(tmp_path: Path) -> None:
     assert [s["role"] for s in contract["outputs"]] == ["action", "memory_out", "log_std"] or contract["memory"]
     again = export_model("verify", tmp_path / "out/last", "--source", path, "--runtimes", "numpy", "--allow-unverified")
     assert again.status == 0, again.err
+
+
+# ------------------------------------------------------------------ skrl
+
+
+@pytest.mark.parametrize(
+    ("change", "value", "message"),
+    [
+        (
+            ("models", "policy", "class"),
+            "MultivariateGaussianMixin",
+            r"models\.policy\.class is MultivariateGaussianMixin",
+        ),
+        (("models", "policy", "output"), "cube(ACTIONS)", "calls cube, which is not known there"),
+        (("models", "policy", "output"), "__import__('os').system('x')", "has a part that is not known"),
+        (("models", "policy", "output"), "2 **", "must be an expression"),
+        (("models", "policy", "network"), [], "must have a container"),
+        (
+            ("models", "policy", "clip_mean_actions"),
+            True,
+            "clip_mean_actions is true: the limits are the environment's",
+        ),
+        (("agent", "observation_preprocessor"), None, "the settings none"),
+        (("agent", "observation_preprocessor"), "Whitening", "is Whitening; RunningStandardScaler is built"),
+        (("models", "separate"), False, "has no policy_layer.weight"),
+    ],
+)
+def test_models_of_skrl_that_are_not_known_are_refused_with_their_key(
+    change: tuple[str, ...], value: Any, message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(SourceError, match=message):
+        read_source(changed_settings(tmp_path, "skrl_ppo", change, value))
+
+
+def test_a_checkpoint_of_skrl_1_calls_observations_states(tmp_path: Path) -> None:
+    """skrl 1.4 in Isaac Lab: STATES, state_preprocessor."""
+    path = checkpoint(tmp_path, "skrl_ppo")
+    file = tmp_path / "run/params/agent.yaml"
+    file.write_text(file.read_text().replace("OBSERVATIONS", "STATES").replace("observation_pre", "state_pre"))
+    writer = Writer()
+    old = {k.replace("observation_pre", "state_pre"): writer.state(s) for k, s in states("skrl_ppo").items()}
+    path.write_bytes(writer.zip(old))
+    (policy,) = read_source(path).policies()
+    golden = read_npz(FOLDER / "skrl_ppo.npz")
+    (answer,) = run_graph(policy.graph, {"state": golden["in/obs"][0]}, ["action"]).values()
+    assert answer == pytest.approx(golden["deterministic_action"][0], abs=2e-6, rel=2e-5)
+
+
+def test_a_checkpoint_of_skrl_without_settings_names_what_is_missing(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match=r"its agent\.yaml is missing(?s:.*)a class of its own"):
+        read_source(checkpoint(tmp_path, "skrl_ppo", settings=""))
+
+
+# ------------------------------------------------------------------ SBX
+
+
+def changed_model(folder: Path, name: str, change: Callable[[dict[str, Any]], None]) -> Path:
+    """A saved model whose ``data`` says something else."""
+    path = folder / "model.zip"
+    with zipfile.ZipFile(FOLDER / f"{name}.zip") as whole, zipfile.ZipFile(path, "w") as other:
+        for entry in whole.infolist():
+            data = whole.read(entry)
+            if entry.filename == "data":
+                content = json.loads(data)
+                change(content)
+                data = json.dumps(content).encode()
+            other.writestr(entry.filename, data)
+    return path
+
+
+def pickled_policy(data: dict[str, Any], old: bytes, new: bytes) -> None:
+    """Put other bytes of the same length into the policy's pickle."""
+    assert len(old) == len(new)
+    code = base64.b64decode(data["policy"][":serialized:"])
+    assert old in code
+    data["policy"][":serialized:"] = base64.b64encode(code.replace(old, new)).decode()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda d: d["policy_class"].update(__module__="sbx.crossq.policies"),
+            r"of sbx\.crossq\.policies, which is not",
+        ),
+        (lambda d: d.pop("policy"), "its policy cannot be read|pickle"),
+        (lambda d: d["policy"].update({":serialized:": "!"}), "its policy cannot be read"),
+        (lambda d: pickled_policy(d, b"Dense_0", b"Conv__0"), "a part that is not built: Conv__0"),
+        (lambda d: pickled_policy(d, b"SquashedGaussianActor", b"SomethingOfOnesOwnxx1"), "its network is Something"),
+        (lambda d: pickled_policy(d, b"kernel", b"kernal"), "has no kernel and bias"),
+        (
+            lambda d: d["observation_space"].update({":type:": "<class 'gymnasium.spaces.discrete.Discrete'>"}),
+            "is Discrete",
+        ),
+    ],
+)
+def test_models_of_sbx_that_are_not_known_are_refused(
+    change: Callable[[dict[str, Any]], None], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(SourceError, match=message):
+        read_source(changed_model(tmp_path, "sbx_sac", change))
+
+
+def test_a_pickle_that_acts_on_the_machine_is_refused_and_does_nothing(tmp_path: Path) -> None:
+    proof = tmp_path / "ran"
+    code = pickle.dumps(Command(f"touch {proof}"))
+    path = changed_model(
+        tmp_path, "sbx_sac", lambda d: d["policy"].update({":serialized:": base64.b64encode(code).decode()})
+    )
+    with pytest.raises(SourceError, match=r"asks for (posix|os)\.system"):
+        read_source(path)
+    assert not proof.exists()
+
+
+class Command:
+    """An object that runs a command where it is unpickled."""
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.system, (self.text,)

@@ -1,4 +1,4 @@
-"""Saved models of Stable-Baselines3 and sb3-contrib (``.zip``), and their unpacked folders."""
+"""Saved models of Stable-Baselines3, sb3-contrib and SBX (``.zip``), and their unpacked folders."""
 
 from __future__ import annotations
 
@@ -12,11 +12,14 @@ if TYPE_CHECKING:
 else:
     _run_folder, _source = defer_imports(__name__, "run_folder", "source")
 
+#: What model.save writes beside ``data``; SBX has no policy.pth.
+_WRITTEN = {"policy.pth", "_stable_baselines3_version"}
+
 FORMATS = (
     Format(
         key="stable_baselines3",
         label="a saved model of Stable-Baselines3 (.zip)",
-        sniff=lambda file: {"data", "policy.pth"} <= set(file.entries),
+        sniff=lambda file: "data" in file.entries and bool(_WRITTEN & set(file.entries)),
         marker="policy.pth",
         read=_source.read,
         takes=frozenset({"activation", "normaliser"}),

@@ -1,7 +1,8 @@
 """A saved model of Stable-Baselines3 as a source: ``data`` (JSON) and ``policy.pth`` (PyTorch's archive) of its ZIP.
 
 Source: stable_baselines3/common/save_util.py. Values that JSON lacks stand in ``data`` as a pickle in base64, with
-their attributes as text beside it: the text is read, the pickle never. The archive is looked into and never unpacked to
+their attributes as text beside it: the text is read, and of SBX, which has no ``policy.pth``, the policy's pickle as
+data. The archive is looked into and never unpacked to
 disk; what its two entries may unfold to is bounded by the file.
 """
 
@@ -17,6 +18,7 @@ from converters.files.torch_archive import Archive
 from converters.files.zip_archives import ZIP_ERRORS, entry_of, open_archive
 from converters.formats.source import NO_NORMALISER, ReadOptions, SourceModel
 from converters.formats.stable_baselines3.run_folder import settings_that_normalise, statistics_beside
+from converters.trainers.pytorch.weights import ArraysByName
 from converters.trainers.registry import rebuild
 from converters.trainers.trainer import Saved
 from signatures.errors import DamagedFileError
@@ -35,10 +37,11 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
     """
     if given.path.is_dir():
         files = tuple(given.path / name for name in (_DATA, _POLICY))
-        data, policy = (given.bytes_of(file) for file in files)
+        found: tuple[bytes, bytes | None] = given.bytes_of(files[0]), given.bytes_of(files[1])
     else:
         files = (given.path,)
-        data, policy = _entries(given.data)
+        found = _entries(given.data)
+    data, policy = found
     try:
         content: Any = json_in(data)
     except (ValueError, RecursionError) as error:
@@ -47,7 +50,8 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
         raise DamagedFileError("its data must be a JSON object", why="what was saved is one", fix=_COPY_AGAIN)
     statistics, notes = _statistics(given, options.normaliser)
     beside = None if statistics is None else (statistics.name, given.bytes_of(statistics))
-    made = rebuild(Saved(given, Archive(policy), content, activation=options.activation, statistics=beside))
+    archive = ArraysByName({}) if policy is None else Archive(policy)
+    made = rebuild(Saved(given, archive, content, activation=options.activation, statistics=beside))
     facts = replace(made.facts, notes=(*made.facts.notes, *notes))
     return [SourceModel(made.graph, (*files, *([] if statistics is None else [statistics])), facts)]
 
@@ -69,11 +73,12 @@ def _statistics(given: Fetched, wanted: str | None) -> tuple[Path | None, tuple[
     )
 
 
-def _entries(data: bytes) -> list[bytes]:
-    """``data`` and ``policy.pth`` of an archive. Raises DamagedFileError."""
+def _entries(data: bytes) -> tuple[bytes, bytes | None]:
+    """``data`` and ``policy.pth`` of an archive; SBX writes no ``policy.pth``. Raises DamagedFileError."""
     try:
         with open_archive(data) as archive:
             most = min(_MOST * len(data), len(data) + _MOST_ADDED)
-            return [entry_of(archive, name, most) for name in (_DATA, _POLICY)]
+            policy = entry_of(archive, _POLICY, most) if _POLICY in archive.namelist() else None
+            return entry_of(archive, _DATA, most), policy
     except ZIP_ERRORS as error:
         raise DamagedFileError(f"its archive cannot be read: {error}", why="it is damaged", fix=_COPY_AGAIN) from error

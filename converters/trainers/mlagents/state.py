@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from converters.files.torch_archive import Archive
 from converters.files.unpickle import Tensor
-from converters.trainers.pytorch.weights import Weights
+from converters.trainers.pytorch.weights import TensorFile, Weights
 from signatures.roles import VERSION_NUMBER
 
 #: What a reader of a checkpoint can always do instead: ML-Agents writes the ONNX when it saves.
@@ -22,7 +21,7 @@ _NOT_POLICY = ("critic.", "value_heads.")
 class State(Weights):
     """The tensors of ``Policy``; ``step_is_float``: its step counter is one of ML-Agents 0.20 and 0.21."""
 
-    def __init__(self, archive: Archive, policy: Mapping[Any, Any]) -> None:
+    def __init__(self, archive: TensorFile, policy: Mapping[Any, Any]) -> None:
         """The actor ``policy`` (``actor_in``) of a checkpoint."""
         value = archive.value
         super().__init__(archive, policy, holder="its Policy", maker="ML-Agents", fix=LET_IT_EXPORT)

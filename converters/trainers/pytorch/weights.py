@@ -4,13 +4,34 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
-from converters.files.torch_archive import Archive
 from converters.files.unpickle import Tensor
 from signatures.errors import DamagedFileError, SourceError
+
+
+class TensorFile(Protocol):
+    """A file that tensors lie in: ``value`` is what was saved, ``array`` a tensor's numbers."""
+
+    value: Any
+
+    def array(self, tensor: Tensor, name: str) -> np.ndarray:
+        """Return the numbers of a tensor of the file; ``name`` is for errors. Raises DamagedFileError."""
+        ...
+
+
+class ArraysByName:
+    """Arrays that are read already, as a file's tensors."""
+
+    def __init__(self, arrays: Mapping[str, np.ndarray]) -> None:
+        self.value: Any = {name: Tensor(a, 0, a.shape, ()) for name, a in arrays.items()}
+
+    def array(self, tensor: Tensor, name: str) -> np.ndarray:
+        """Return a tensor's numbers."""
+        found: np.ndarray = tensor.storage
+        return found
 
 
 class Weights:
@@ -18,7 +39,7 @@ class Weights:
     do where one is not understood.
     """
 
-    def __init__(self, archive: Archive, tensors: Mapping[Any, Any], *, holder: str, maker: str, fix: str) -> None:
+    def __init__(self, archive: TensorFile, tensors: Mapping[Any, Any], *, holder: str, maker: str, fix: str) -> None:
         self._archive, self._holder, self._maker, self._fix = archive, holder, maker, fix
         self._tensors: Mapping[str, Tensor] = {
             k: v for k, v in tensors.items() if isinstance(k, str) and isinstance(v, Tensor)

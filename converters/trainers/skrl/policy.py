@@ -34,6 +34,8 @@ EXPORT_ONNX = "load it in skrl, export the policy (torch.onnx.export, its prepro
 #: Statistics of the observations, of 2.x and of 1.x.
 PREPROCESSORS = ("observation_preprocessor", "state_preprocessor")
 _OBSERVED = ("OBSERVATIONS", "STATES")
+#: Words of an output's expression: a layer with a number for each action, or one.
+_SIZED = ("ACTIONS", "ONE")
 _CLASSES = ("GaussianMixin", "DeterministicMixin", "CategoricalMixin")
 #: RunningStandardScaler: (x − mean) / (√variance + ε), clamped.
 _EPSILON, _LIMIT = 1e-8, 5.0
@@ -179,7 +181,7 @@ def _containers(made: _Making, *, shared: bool) -> str:
         net.at(f"{name}_container")
         x = evaluate(net, container.text("input"), made.tensor, partial(container.error, "input"))
         last = number == len(containers) - 1
-        x = _layers(made, x, container, f"{name}_container", embedded=last and not shared)
+        x = _layers(made, x, container, f"{name}_container", embedded=last and not shared and _has_layer(made.model))
         made.tensors[name] = x
     return x
 
@@ -202,9 +204,7 @@ def _layers(made: _Making, x: str, container: Settings, module: str, *, embedded
         if activation is not None:
             x = activation(net, x)
             place += 1
-    if embedded and f"{module}.{place}.weight" in net.state:
-        x = net.linear(x, f"{module}.{place}")
-    return x
+    return net.linear(x, f"{module}.{place}") if embedded else x
 
 
 def _plan(container: Settings) -> tuple[list[tuple[str, Any]], list[Activation | None]]:
@@ -270,13 +270,18 @@ def _window(container: Settings, arguments: Any) -> Window:
 # ------------------------------------------------------------------ heads
 
 
+def _has_layer(model: Settings) -> bool:
+    """Whether the output is a layer of its own: where its expression names what it has one number of each."""
+    return any(token in model.text("output") for token in _SIZED)
+
+
 def _output(made: _Making, x: str, *, shared: bool) -> str:
     """Return the result of the model's output expression."""
     net, text = made.net, made.model.text("output")
     if shared:
-        x = net.linear(x, "policy_layer") if "policy_layer.weight" in net.state else x
+        x = net.linear(x, "policy_layer") if _has_layer(made.model) else x
     net.at("output")
-    known = dict.fromkeys(("ACTIONS", "ONE"), x)
+    known = dict.fromkeys(_SIZED, x)
     return evaluate(
         net, text, lambda name: known.get(name) or made.tensors.get(name), partial(made.model.error, "output")
     )

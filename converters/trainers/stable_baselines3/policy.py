@@ -14,14 +14,13 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from converters.files.torch_archive import Archive
 from converters.graph.nn.activations import Activation, clip
 from converters.graph.nodes import Graph
 from converters.graph.types import FLOAT32, INT64
 from converters.policy.facts import SourceFacts
 from converters.trainers.pytorch.activations import activation_from_user, activation_named
 from converters.trainers.pytorch.network import Network
-from converters.trainers.pytorch.weights import Weights, pytorch_alone
+from converters.trainers.pytorch.weights import TensorFile, Weights, pytorch_alone
 from converters.trainers.stable_baselines3.layers import renormalised_mlp
 from converters.trainers.stable_baselines3.normaliser import Normaliser
 from converters.trainers.stable_baselines3.spaces import Space, space_of
@@ -69,7 +68,7 @@ class _Built:
 
 def to_graph(
     data: Mapping[str, Any],
-    archive: Archive,
+    archive: TensorFile,
     state: Mapping[Any, Any],
     activation: str | None,
     normaliser: Normaliser | None,

@@ -1,0 +1,84 @@
+"""Mutants of robots' checkpoints: their settings, their weights, and the pickled policies of SBX."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import tempfile
+import zipfile
+from pathlib import Path
+from random import Random
+
+import yaml
+
+from fixtures.robots import FOLDER
+from tests.fuzz import changes, mutation
+from tests.fuzz.changes import Files
+from tests.torch_checkpoint.robots import checkpoint
+
+#: Settings that bytes are put into: anchors, tags, indentation.
+_PIECES = (
+    b"&a ",
+    b"*a",
+    b"!!python/tuple ",
+    b"- ",
+    b"  ",
+    b"\n",
+    b"{",
+    b"]",
+    b": ",
+    b"1e999",
+    b"|\n",
+    b"? ",
+    b"<<: *a",
+)
+
+
+def runs() -> list[Files]:
+    """Return a checkpoint of each kind with its settings beside it."""
+    found = []
+    for settings in sorted(FOLDER.glob("*.yaml")):
+        with tempfile.TemporaryDirectory() as folder:
+            path = checkpoint(Path(folder), settings.stem, "policy.pt", "agent.yaml")
+            found.append({name: (path.parent / name).read_bytes() for name in ("policy.pt", "agent.yaml")})
+    return found
+
+
+def change_run(files: Files, random: Random) -> Files:
+    """Change the settings as a tree or as bytes, or the checkpoint."""
+    draw = random.random()
+    if draw < 0.3:
+        return {**files, **changes.pickled({"policy.pt": files["policy.pt"]}, random)}
+    data = files["agent.yaml"]
+    if draw < 0.8:
+        tree = mutation.json_tree(yaml.safe_load(data), random)
+        changed = json.dumps(tree).encode("utf-8", "surrogatepass")
+    elif draw < 0.95:
+        at = random.randrange(len(data))
+        changed = data[:at] + random.choice(_PIECES) + data[at + random.randrange(3) :]
+    else:
+        changed = mutation.damaged(data, random)
+    return {**files, "agent.yaml": changed}
+
+
+def saved_policies() -> list[Files]:
+    """Return models that SBX saved."""
+    return [{"policy.zip": f.read_bytes()} for f in sorted(FOLDER.glob("sbx_*.zip"))]
+
+
+def change_saved_policy(files: Files, random: Random) -> Files:
+    """Change the pickled policy by its opcodes, or what stands beside it."""
+    with zipfile.ZipFile(io.BytesIO(files["policy.zip"])) as archive:
+        entries = {e.filename: archive.read(e) for e in archive.infolist()}
+    content = json.loads(entries["data"])
+    if random.random() < 0.6:
+        code = base64.b64decode(content["policy"][":serialized:"])
+        code = mutation.parts(changes.opcodes(code), random, changes.opcode)
+        content["policy"][":serialized:"] = base64.b64encode(code).decode()
+    else:
+        policy = content.pop("policy")
+        content = mutation.json_tree(content, random)
+        content = {**content, "policy": policy} if isinstance(content, dict) else content
+    entries["data"] = json.dumps(content).encode("utf-8", "surrogatepass")
+    return {"policy.zip": changes.zipped(entries)}

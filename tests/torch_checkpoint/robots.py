@@ -1,0 +1,41 @@
+"""Checkpoints of robots' trainers (fixtures/robots), as the libraries write them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from fixtures.robots import FOLDER
+from fixtures.torch_checkpoint.cases import waves
+from tests.torch_checkpoint.pt_files import Writer
+
+
+def states(name: str) -> dict[str, dict[str, np.ndarray]]:
+    """The checkpoint's state dictionaries by key."""
+    return {
+        key: {
+            n: np.array(e["values"], e["dtype"]).reshape(e["shape"])
+            if "values" in e
+            else waves(n, e["shape"]).astype(e["dtype"])
+            for n, e in layout.items()
+        }
+        for key, layout in json.loads((FOLDER / f"{name}.json").read_text()).items()
+    }
+
+
+def checkpoint(
+    folder: Path, name: str, place: str = "run/nn/last.pth", settings: str = "run/params/agent.yaml"
+) -> Path:
+    """The checkpoint and its settings, laid out as Isaac Lab does; of SBX the saved model."""
+    if (FOLDER / f"{name}.zip").exists():
+        return FOLDER / f"{name}.zip"
+    writer = Writer()
+    path = folder / place
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(writer.zip({**{k: writer.state(s) for k, s in states(name).items()}, "epoch": 3, "frame": 9}))
+    if settings:
+        (folder / settings).parent.mkdir(parents=True, exist_ok=True)
+        (folder / settings).write_bytes((FOLDER / f"{name}.yaml").read_bytes())
+    return path
