@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import NoReturn
 
 from converters.formats.format import WriteOptions
+from converters.formats.registry import WRITTEN
 from converters.policy.policy import Policy
 from signatures.errors import ProfileError
 from signatures.records import dataclass
@@ -20,7 +21,6 @@ class Profile:
     ``converters/consumers/unity/readings.py`` that must read every construct of the ONNX rightly, ``checkers`` the
     releases of ``converters/consumers/unity/consumers.py`` whose checks must accept it, ``players`` those whose player
     must play it. ``opset`` is the ONNX opset.
-    ``own_names`` are formats whose writer gives a policy the consumer's names by itself (``.nn`` of API version 2).
     ``code`` is the snippet that says how to use its files.
     """
 
@@ -29,12 +29,16 @@ class Profile:
     purpose: str
     formats: tuple[str, ...]
     dress: Callable[[Policy], Policy]
-    own_names: frozenset[str] = frozenset()
     opset: int = 15
     importers: tuple[str, ...] = ()
     checkers: tuple[str, ...] = ()
     players: tuple[str, ...] = ()
     code: str = "agent"
+
+    @property
+    def own_names(self) -> frozenset[str]:
+        """The formats whose files have this consumer's names in every bundle (``.nn`` of API version 2)."""
+        return frozenset(key for key in self.formats if WRITTEN[key].consumer == self.name)
 
     def write_options(self, contract: str) -> WriteOptions:
         """Return how a writer makes the files of this consumer."""

@@ -76,7 +76,6 @@ PROFILES: tuple[Profile, ...] = (
         purpose="ML-Agents 1.0 to 1.9 (releases 1 to 16) in Unity 2018 to 2020 (Barracuda 1.0 to 1.3); "
         "memory in .nn alone",
         formats=(ONNX.key, BARRACUDA.key),
-        own_names=frozenset({BARRACUDA.key}),
         dress=partial(version2.dress, profile="barracuda-1.0"),
         opset=11,
         importers=("Barracuda 1.1.2", "Barracuda 1.4.0"),

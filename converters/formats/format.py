@@ -168,9 +168,10 @@ class Format:
       once; ``inner`` gives the graph's tensors inside of one that is loaded (None: it hides them), ``origins`` what the
       source called them, where an artefact notes it; ``dtypes`` are the only ones that it has (empty: all);
       ``answers`` are the outputs of a policy that an artefact answers (None: all). ``graph`` reads the graph of an
-      artefact of ours, ``kernels`` runs one by the numpy kernels (None: what its reader makes of it is run).
+      artefact of ours (None: its reader does).
       ``elsewhere`` is what alone runs it besides, where that cannot be asked; ``unity``: Unity loads it, if its names
-      are those that a profile (``--for``) gives. ``narrow``: it can hold weights in
+      are those that a profile (``--for``) gives; ``consumer`` is the profile whose names its files have, whichever
+      those of their bundle are. ``narrow``: it can hold weights in
       float16 or int8. ``fixed``: it can be written for a fixed number of agents.
       ``library`` is a Python package that runs such a file by itself; verification does not ask it.
       ``program``: it is source code, which is run right after it was written and never again, since anyone may have
@@ -202,9 +203,9 @@ class Format:
     dtypes: frozenset[str] = frozenset()
     answers: Callable[[PolicySignature], list[str]] | None = None
     graph: Callable[[Path], Graph] | None = None
-    kernels: Callable[[Path], Kernels] | None = None
     elsewhere: str = ""
     unity: bool = False
+    consumer: str = ""
     narrow: bool = False
     fixed: bool = False
     library: str = ""

@@ -18,7 +18,8 @@ class Policy:
 
     ``feeds`` maps an input's canonical name to the Placeholder that takes it, ``fetches`` an output's canonical name
     to the tensor that gives it. After the naming pass both map names to themselves. ``constants`` are outputs that are
-    the same in every run and that a consumer reads beside the actions (``version_number``); only ONNX has them.
+    the same in every run and that a consumer reads beside the actions (``version_number``). ``kept`` are memories that
+    the consumer's runtime carries from step to step by itself: the input, and the output that is its next value.
     """
 
     name: str
@@ -28,6 +29,7 @@ class Policy:
     fetches: Mapping[str, str]
     source: SourceMap = field(default_factory=SourceMap)
     constants: Mapping[str, np.ndarray] = field(default_factory=dict)
+    kept: Mapping[str, str] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return f"<Policy {self.name!r}: {self.signature.flow}, {len(self.graph.nodes)} nodes>"

@@ -79,14 +79,14 @@ def artefacts_of(
             artifacts, notes = list[Artifact](), list[str]()
             for form in formats:
                 try:
-                    artifacts.append(form.artifact(job.policy, how))
+                    artifacts.append(_artifact(form, job.policy, how))
                 except TooLargeError as error:
                     if options.targets is not None:
                         raise
                     notes.append(f"{form.key} was left out: {error.what}: {error.why}")
             return contract, artifacts, tuple(notes)
         how = job.profile.write_options(contract.compact())
-        artifacts = [f.artifact(job.policy, how) for f in formats]
+        artifacts = [_artifact(f, job.policy, how) for f in formats]
         if job.profile.importers:
             from converters.consumers.importable import importable
             from converters.consumers.playable import playable
@@ -95,6 +95,14 @@ def artefacts_of(
                 importable(job.profile, artifact.files, job.policy.name)
                 playable(job.profile, artifact.files, job.policy.name)
         return contract, artifacts, ()
+
+
+def _artifact(form: Format, policy: Policy, how: WriteOptions) -> Artifact:
+    if not form.consumer:  # a plain export loads nothing of consumers
+        return form.artifact(policy, how)
+    from converters.consumers.named_files import artifact_of
+
+    return artifact_of(form, policy, how)
 
 
 def contract_of(

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from converters.compiler.options import CompileOptions
+from converters.consumers.named_files import artifact_of
 from converters.formats.format import Format, WriteOptions
 from converters.formats.registry import WRITTEN
 from converters.formats.source import ReadOptions
@@ -182,7 +183,7 @@ def _refusal(path: Path, policy: Policy, target: Format) -> str | None:
     """Why a target cannot take the policy, None if it can: the writer is asked, nothing is kept."""
     try:
         with naming(path):
-            target.artifact(policy, WriteOptions("{}"))
+            artifact_of(target, policy, WriteOptions("{}"))
     except ExportModelError as error:
         return error.what
     return None

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from converters.consumers.named_files import answered_outputs
 from converters.files.children.process import LoadedModel, RunFailedError
 from converters.formats.registry import FROZEN_GRAPH, WRITTEN
 from converters.formats.source import OriginalRun
@@ -158,7 +159,6 @@ def participants_of(
 
     What does not load goes to ``failure`` (format, runtime, error) and takes no part.
     """
-    outputs = [s.name for s in tested.signature.outputs]
     if reference.original is not None:  # else it would be held against itself
         yield reference.participant("reference", reference.asked, path=tested.reference)
     pairs = [(kind, r) for kind in tested.artefacts for r in WRITTEN[kind].runtimes if tested.batch or r not in FIXED]
@@ -168,8 +168,7 @@ def participants_of(
     # The others run while TensorFlow is still being imported; ``in_order`` puts the report right again.
     for kind, runtime in sorted(taking_part, key=lambda pair: pair[1] == _SLOWEST):
         path = tested.artefacts[kind]
-        answers = WRITTEN[kind].answers
-        loads = {"": list(outputs) if answers is None else answers(tested.signature)}
+        loads = {"": answered_outputs(WRITTEN[kind], tested.signature)}
         if WRITTEN[kind].signatures:
             loads = {key: list(names[1]) for key, names in tested.signatures.items()}
         for key, names in loads.items():

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from converters.consumers.named_files import answered_outputs
 from converters.files.children.process import LoadedModel, RunFailedError
 from converters.formats.registry import FROZEN_GRAPH, WRITTEN
 from converters.graph.nodes import Graph
@@ -43,9 +44,8 @@ class Reference(AbstractContextManager["Reference"]):
         self.name = "numpy"
         #: the outputs that the source answered for
         self._given: frozenset[str] = frozenset()
-        own = WRITTEN[form].answers
         #: the outputs that the kernels have
-        self.asked = [s.name for s in self.signature.outputs] if own is None else own(self.signature)
+        self.asked = answered_outputs(WRITTEN[form], self.signature)
         #: id of inputs → these, and what the kernels answered
         self._known: dict[int, tuple[Arrays, dict[str, np.ndarray]]] = {}
         self._loaded = [self.model]

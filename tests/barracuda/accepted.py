@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+from converters.consumers.named_files import artifact_of
 from converters.consumers.unity.checker import check_file
 from converters.consumers.unity.consumers import CONSUMERS
 from converters.consumers.unity.settings import Brain, sensors_of
@@ -37,7 +38,7 @@ def agent_of(policy: Policy) -> Brain:
 
 
 def assert_accepted(policy: Policy, folder: Path) -> None:
-    (data,) = WRITTEN["nn"].artifact(policy, WriteOptions("{}")).files.values()
+    (data,) = artifact_of(WRITTEN["nn"], policy, WriteOptions("{}")).files.values()
     file = folder / "policy.nn"
     data.write(file)
     verdict = check_file(file, CONSUMERS["R20"], agent_of(policy))

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
+from converters.consumers.mlagents.version2 import dress_nn
 from converters.formats.barracuda.format import NnModel
-from converters.formats.barracuda.lower import base_name
+from converters.formats.barracuda.lower import policy_model
 from converters.policy.policy import Policy
 from signatures.roles import ACTION_NAMES, Role
 from signatures.spec import TensorSpec
@@ -48,6 +50,33 @@ def fed(policy: Policy, model: NnModel, feeds: Arrays) -> dict[str, Array]:
             start += part.shape[3]
     assert set(found) >= {i.name for i in model.inputs}
     return found
+
+
+def base_name(spec: TensorSpec) -> str:
+    """An output's name without the scope of its brain, which names of the source have."""
+    return spec.name.rpartition("/")[2]
+
+
+def nn_model(policy: Policy) -> NnModel:
+    """The policy's file before it is encoded, in the names of ML-Agents."""
+    return policy_model(dress_nn(policy, "barracuda-1.0"))
+
+
+def action_model(policy: Policy) -> NnModel:
+    """The action alone, under the policy's own names."""
+    outputs = tuple(s for s in policy.signature.outputs if s.name == "action")
+    signature = replace(policy.signature, outputs=outputs)
+    return policy_model(replace(policy, signature=signature, fetches={"action": policy.fetches["action"]}))
+
+
+def action_of(policy: Policy, model: NnModel, feeds: Arrays) -> Array:
+    """The action [B, …] of ``action_model``: images lie as the policy has them, rows of rows transposed."""
+    rows, laid = policy.signature.rows(feeds), {}
+    for given in model.inputs:
+        array = np.asarray(feeds[given.name], np.float64)
+        array = array.transpose(0, 2, 1) if array.ndim == 3 else array
+        laid[given.name] = array.reshape(rows, *given.shape[1:])
+    return evaluate(model, laid)["action"].reshape(rows, -1)
 
 
 def answered(policy: Policy, model: NnModel, feeds: Arrays, dtype: type = np.float64) -> dict[str, Array]:

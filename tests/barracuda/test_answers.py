@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from converters.compiler.options import CompileOptions
-from converters.formats.barracuda.answers import NnPolicy, answered_outputs, contract_of
+from converters.consumers.mlagents.own_names import NnPolicy, answered_outputs
+from converters.consumers.named_files import artifact_of
 from converters.formats.barracuda.format import parse
-from converters.formats.barracuda.writer import encode
+from converters.formats.barracuda.writer import contract_of, encode
 from converters.formats.format import WriteOptions
 from converters.formats.registry import DEFAULTS, WRITTEN
 from converters.graph.run import run_graph
@@ -42,7 +43,7 @@ def test_it_answers_every_output_but_a_drawn_class(path: Path, options: dict[str
     for policy in policies(path, **options):
         signature = policy.signature
         contract = WriteOptions(json.dumps(signature.to_dict()))
-        (data,) = WRITTEN["nn"].artifact(policy, contract).files.values()
+        (data,) = artifact_of(WRITTEN["nn"], policy, contract).files.values()
         nn = NnPolicy(data.to_bytes())
         assert nn.signature.to_dict() == signature.to_dict()
         names = answered_outputs(signature)
@@ -64,7 +65,7 @@ def test_what_a_nn_has_no_name_for_is_not_answered_by_its_action(role: Role) -> 
     extra = replace(signature.output("value_estimate"), name="extra", role=role)
     signature = replace(signature, outputs=(*signature.outputs, extra))
     more = replace(policy, signature=signature, fetches={**policy.fetches, "extra": policy.fetches["value_estimate"]})
-    (data,) = WRITTEN["nn"].artifact(more, WriteOptions(json.dumps(signature.to_dict()))).files.values()
+    (data,) = artifact_of(WRITTEN["nn"], more, WriteOptions(json.dumps(signature.to_dict()))).files.values()
     names = answered_outputs(signature)
     assert names == [s.name for s in policy.signature.outputs]
     feeds = some(policy, 3)
@@ -73,7 +74,7 @@ def test_what_a_nn_has_no_name_for_is_not_answered_by_its_action(role: Role) -> 
 
 def test_a_file_without_a_contract_says_so() -> None:
     policy = policies(FIXTURES[0])[0]
-    (data,) = WRITTEN["nn"].artifact(policy, WriteOptions("{}")).files.values()
+    (data,) = artifact_of(WRITTEN["nn"], policy, WriteOptions("{}")).files.values()
     model = parse(data.to_bytes())
     for other in (model, replace(model, trailer=None)):
         with pytest.raises(DamagedFileError, match="no contract"):

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from converters.compiler.compile import compile_graph
-from converters.formats.barracuda.lower import policy_model
 from converters.formats.frozen_graph.reader import read_graph
 from converters.policy.policy import Policy
 from signatures.errors import UnsupportedOpError
+from tests.barracuda.nn_running import nn_model
 from tests.handmade import NodeDef, constant, graph_bytes, node, placeholder
 
 X = "vector_observation"
@@ -86,7 +86,7 @@ def test_it_is_refused_before_it_is_made(nodes: list[NodeDef], words: str) -> No
     tracemalloc.start()
     try:
         with pytest.raises(UnsupportedOpError, match=words) as caught:
-            policy_model(read)
+            nn_model(read)
         assert tracemalloc.get_traced_memory()[1] < limit
     finally:
         tracemalloc.stop()
@@ -97,4 +97,4 @@ def test_it_is_refused_before_it_is_made(nodes: list[NodeDef], words: str) -> No
     "nodes", [best_of(1024), hot(30, 10), spread(1, 1 << 11), hot_constant(64)], ids=["best", "hot", "spread", "kernel"]
 )
 def test_what_a_policy_has_of_these_is_written(nodes: list[NodeDef]) -> None:
-    assert policy_model(policy(*nodes)).layers
+    assert nn_model(policy(*nodes)).layers

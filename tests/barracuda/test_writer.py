@@ -16,23 +16,23 @@ import numpy as np
 import pytest
 
 from converters.compiler.options import CompileOptions
+from converters.consumers.named_files import artifact_of
 from converters.formats.barracuda.format import NnModel, parse
-from converters.formats.barracuda.lower import base_name
 from converters.formats.barracuda.vocabulary import LayerType
-from converters.formats.barracuda.writer import write
 from converters.formats.format import WriteOptions
+from converters.formats.registry import WRITTEN
 from converters.graph.nodes import Graph, Node, TensorShape
 from converters.graph.run import run_graph
 from converters.graph.types import FLOAT32
 from converters.policy.policy import Policy
 from exporter.export.sources import read_source
 from signatures.contract import EMBEDDED
-from signatures.errors import SignatureError, UnsupportedOpError
+from signatures.errors import ProfileError, UnsupportedOpError
 from signatures.roles import ACTION_NAMES, Role
 from signatures.spec import Memory, PolicySignature, TensorSpec
 from tests import known
 from tests.barracuda.accepted import assert_accepted
-from tests.barracuda.nn_running import answered, fed, some, wanted
+from tests.barracuda.nn_running import answered, base_name, fed, some, wanted
 from tests.barracuda.nn_safety import assert_safe
 from tests.barracuda.reference import evaluate
 from tests.corpus.conftest import genuine_cases
@@ -43,7 +43,7 @@ FIXTURES = sorted((Path(__file__).resolve().parents[2] / "fixtures").glob("*.byt
 
 def written(policy: Policy, contract: str = "{}") -> NnModel:
     """A policy's file, read again; it is safe in every Barracuda."""
-    files = write(policy, WriteOptions(contract))
+    files = artifact_of(WRITTEN["nn"], policy, WriteOptions(contract)).files
     assert list(files) == [f"{policy.name}.nn"]
     model = parse(files[f"{policy.name}.nn"].to_bytes())
     assert_safe(model)
@@ -110,7 +110,8 @@ def test_the_file_has_what_ml_agents_looks_for(path: Path) -> None:
 @pytest.mark.parametrize("path", FIXTURES, ids=lambda p: p.stem)
 def test_the_bytes_are_the_same_every_time_and_carry_the_contract(path: Path) -> None:
     contract = json.dumps({"name": "Größe", "inputs": []})
-    (data,), (again,) = (write(p, WriteOptions(contract)).values() for p in (policies(path)[0], policies(path)[0]))
+    made = [artifact_of(WRITTEN["nn"], policies(path)[0], WriteOptions(contract)) for _ in range(2)]
+    (data,), (again,) = (artifact.files.values() for artifact in made)
     data = data.to_bytes()
     assert data == again.to_bytes()
     assert parse(data).metadata(EMBEDDED) == contract
@@ -229,12 +230,12 @@ def test_a_memory_has_its_parts_in_the_policys_order(
 SOURCES = [p for p in known.sources() if p.suffix != ".keras" and p.name != "raw_graph_def.pb"]
 #: Files of ../shared that a ``.nn`` cannot hold, and the node, op or output that the error names.
 REFUSED = {
-    "corpus/onnx/AliBharwani+ml-agents__CustomResidualAttentionWithLayerNorm.onnx": "'entities_0' (Placeholder)",
-    "corpus/onnx/AliBharwani+ml-agents__Dodge-18499955.onnx": "'entities_0' (Placeholder)",
-    "genuine/0.3.0-bc-continuous-recurrent/MyEnv_ppo.bytes": "takes a memory and gives none",
-    "foreign/clean_c51__legacy.onnx": "(ArgMax)",
+    "corpus/onnx/AliBharwani+ml-agents__CustomResidualAttentionWithLayerNorm.onnx": "entities_0 is a list of entities",
+    "corpus/onnx/AliBharwani+ml-agents__Dodge-18499955.onnx": "entities_0 is a list of entities",
+    "genuine/0.3.0-bc-continuous-recurrent/MyEnv_ppo.bytes": "is taken but not given back",
+    "foreign/clean_c51__legacy.onnx": "(Reshape) cannot be written to a .nn: the shape of",
     "foreign/convlstm__legacy.onnx": "reshapes the memory",
-    "foreign/sb3_recurrent_disc_own_forward__legacy_fixed.onnx": "(ArgMax)",
+    "foreign/sb3_recurrent_disc_own_forward__legacy_fixed.onnx": "reshapes the memory",
     "foreign/entity_attention__legacy.onnx": "(Reshape) cannot be written to a .nn: the shape of",
     "foreign/rsl_lstm_2l__legacy_fixed.onnx": "reshapes the memory",
     "foreign/sb3_recurrent_disc_2l__legacy_dyn.onnx": "reshapes the memory",
@@ -252,7 +253,7 @@ def test_every_policy_is_written_accepted_and_answers_the_same_or_is_refused_by_
     for policy in found:
         try:
             model = written(policy)
-        except (UnsupportedOpError, SignatureError) as error:
+        except (UnsupportedOpError, ProfileError) as error:
             assert REFUSED.get(name, "?") in str(error), f"{name}: {error}"
             assert error.why
             assert error.fix

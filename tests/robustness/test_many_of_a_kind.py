@@ -14,12 +14,12 @@ from converters.compiler import compile
 from converters.files import tensorflow_messages as schema
 from converters.formats.barracuda import format as nn
 from converters.formats.barracuda import lower_base
-from converters.formats.barracuda.writer import policy_model
 from converters.formats.frozen_graph.reader import read_graph
 from converters.formats.saved_model import signature
 from exporter.export.sources import read_source
 from signatures.errors import MAX_LINE, DamagedFileError, GraphError, NotAPolicyError, UnsupportedOpError
 from tests.barracuda.nn_files import write_nn
+from tests.barracuda.nn_running import nn_model
 from tests.handmade import constant, continuous_policy, graph_bytes, graph_def, node
 from tests.hostile import zoo
 
@@ -230,10 +230,10 @@ def test_a_nn_of_more_joined_tensors_than_any_policy_has_is_refused(
     join = node("join", "ConcatV2", *["mu"] * MANY, "axis", N=MANY, T=np.float32, Tidx=np.int32)
     nodes = [*continuous_policy()[:-1], constant("axis", 1), join, node("action", "Tanh", "join", T=np.float32)]
     (policy,) = read_source(zoo.frozen(tmp_path, nodes)).policies()
-    assert policy_model(policy)
+    assert nn_model(policy)
     monkeypatch.setattr(lower_base, "MAX_PIECES", MANY - 1)
     with pytest.raises(UnsupportedOpError, match=f"{MANY} tensors are joined"):
-        policy_model(policy)
+        nn_model(policy)
 
 
 def test_what_a_layer_is_called_is_a_text(tmp_path: Path) -> None:

@@ -67,9 +67,7 @@ def reason(error: ExportModelError) -> str:
     text = re.sub(r"has \d+ branches", "has several branches", text)
     text = re.sub(r"its observation \w+ is", "one of its observations is", text)
     text = re.sub(r"its memory \(.*\)", "its memory", text)
-    text = re.sub(r"Reshape cannot be written to a .nn: .*\['\?.*", "it has rows for each of several entities", text)
-    text = re.sub(r"Placeholder cannot be written to a .nn: .*", "one of its observations is a list of entities", text)
-    return re.sub(r"the policy takes a memory and gives none, .*", "its memory is taken but not given back", text)
+    return re.sub(r"Reshape cannot be written to a .nn: .*\['\?.*", "it has rows for each of several entities", text)
 
 
 def tried(

@@ -14,13 +14,13 @@ from typing import NoReturn
 
 import numpy as np
 
+from converters.consumers.mlagents.names import MASKS, PREVIOUS
 from converters.consumers.mlagents.naming import Dressing
 from converters.graph.types import BATCH, FLOAT32, INT32
 from signatures.roles import SENSOR_ORDER, Role
 from signatures.spec import TensorSpec
 
 _OBS = re.compile(r"(?:.*/)?obs_(\d+)(?::0)?")
-MASKS, PREVIOUS = "action_masks", "prev_action"
 
 
 def observation_names(dressing: Dressing) -> list[tuple[str, TensorSpec]]:
@@ -100,14 +100,13 @@ def take_joined(dressing: Dressing, name: str, vectors: list[TensorSpec]) -> Non
         else:
             take_observation(dressing, name, vectors[0])
         return
-    widths = [s.shape[-1] for s in vectors]
-    if any(w is None or len(s.shape) != 2 for w, s in zip(widths, vectors, strict=True)):
+    if any(None in s.shape[1:] for s in vectors):
         dressing.refuse(
             f"the shape of its observation {vectors[0].name} is {list(vectors[0].shape)}",
             why="vectors are fed as one row of a known width",
             fix="export the model again with all lengths but the batch fixed",
         )
-    known = [int(w or 0) for w in widths]
+    known = [math.prod(d or 1 for d in s.shape[1:]) for s in vectors]
     joined = TensorSpec(name, Role.VECTOR, "float32", (None, sum(known)), tuple(str(s.source) for s in vectors))
     taken = dressing.take(name, joined, (None, sum(known)))
     for number, (spec, width) in enumerate(zip(vectors, known, strict=True)):

@@ -9,8 +9,10 @@ beginning are what it would have been fed, too.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 from converters.consumers.mlagents import input_mapping as feeding
+from converters.consumers.mlagents.names import ACTION, CONTINUOUS, DISCRETE, RECURRENT_IN, RECURRENT_OUT
 from converters.consumers.mlagents.naming import Dressing, row
 from converters.graph.types import FLOAT32
 from signatures.records import dataclass
@@ -53,8 +55,8 @@ def take_memory(dressing: Dressing, carried: TensorSpec | None, shape: Shape) ->
     size = kept + columns
     if not size:
         return RecurrentState(0)
-    spec = own or TensorSpec("recurrent_in", Role.MEMORY_IN, "float32", shape(size), None)
-    taken = dressing.take("recurrent_in", spec, shape(size))
+    spec = own or TensorSpec(RECURRENT_IN, Role.MEMORY_IN, "float32", shape(size), None)
+    taken = dressing.take(RECURRENT_IN, spec, shape(size))
     if carried is None:
         dressing.give_in(spec, taken)
         return RecurrentState(size)
@@ -73,7 +75,7 @@ def take_memory(dressing: Dressing, carried: TensorSpec | None, shape: Shape) ->
 
 
 def _is_deterministic(dressing: Dressing) -> bool:
-    actions = [s.role for s in dressing.policy.signature.outputs if s.name in ("action", "discrete_actions")]
+    actions = [s.role for s in dressing.policy.signature.outputs if s.name in (ACTION, DISCRETE)]
     return Role.DETERMINISTIC in actions
 
 
@@ -94,15 +96,15 @@ def give_memory(dressing: Dressing, state: RecurrentState, shape: Shape) -> Memo
     wanted = [-1 if d is None else d for d in shape(state.size)]
     if len(wanted) > 2:
         given = builder.add("Reshape", [given, builder.ints(wanted, "memory")], "recurrent_out/rows")
-    dressing.give("recurrent_out", given, Role.MEMORY_OUT)
+    dressing.give(RECURRENT_OUT, given, Role.MEMORY_OUT)
     layout = () if memory is None or state.columns else memory.layout
-    return Memory(state.size, "recurrent_in", "recurrent_out", layout)
+    return Memory(state.size, RECURRENT_IN, RECURRENT_OUT, layout)
 
 
 def _last_action(dressing: Dressing, columns: int) -> str:
     """The action [B, columns] as float32: the discrete one, which ML-Agents feeds as the last, else the continuous."""
     builder = dressing.builder
-    names = [n for n in ("discrete_actions", "action", "continuous_actions") if n in dressing.fetches]
+    names = [n for n in (DISCRETE, ACTION, CONTINUOUS) if n in dressing.fetches]
     width = builder.length(dressing.fetches[names[0]], -1)
     if width != columns:
         dressing.refuse(
@@ -111,3 +113,63 @@ def _last_action(dressing: Dressing, columns: int) -> str:
             fix="say which output is the action: --output NAME=action",
         )
     return row(builder, builder.cast(dressing.fetches[names[0]], FLOAT32), columns)
+
+
+# ------------------------------------------------------------------ in parts, which Barracuda carries by itself
+
+#: The parts of a memory that does not say of how many it is made; ML-Agents asks for a ``_c`` and a ``_h``.
+_HALVES = ("c", "h")
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """A part of a memory: what its input and its output are called, and how many numbers it has."""
+
+    taken: str
+    given: str
+    size: int
+
+
+def memory_parts(memory: Memory) -> list[Part]:
+    """Return the parts of a memory of more than one number: those that it names, else two halves."""
+    layout, size = memory.layout, memory.size
+    if len(layout) < 2 or size % len(layout):
+        layout, sizes = _HALVES, [size - size // 2, size // 2]
+    else:
+        sizes = [size // len(layout)] * len(layout)
+    groups = [layout[:number].count(part) for number, part in enumerate(layout)]
+    ends = [f"_{group}_{part}" if group else f"_{part}" for group, part in zip(groups, layout, strict=True)]
+    return [Part(RECURRENT_IN + e, RECURRENT_OUT + e, n) for e, n in zip(ends, sizes, strict=True)]
+
+
+def take_parts(dressing: Dressing) -> list[Part]:
+    """Take the memory in its parts. Raises ProfileError where the source gives none back, or one number."""
+    memory = dressing.policy.signature.memory
+    if memory is None or memory.input is None:
+        return []
+    own = dressing.policy.signature.input(memory.input)
+    if memory.output is None:
+        feeding.refuse_lost_memory(dressing, own.name)
+    if memory.size < 2:
+        dressing.refuse(
+            "its memory is one number",
+            why="ML-Agents asks for a memory in two parts",
+            fix="write another format: the others hold it",
+        )
+    parts = memory_parts(memory)
+    taken = [dressing.take(p.taken, replace(own, source=None), (None, p.size)) for p in parts]
+    dressing.give_in(own, dressing.builder.concat(taken, 1))
+    return parts
+
+
+def give_parts(dressing: Dressing, parts: list[Part]) -> None:
+    """Give the memory in its parts, which Barracuda feeds back."""
+    memory, builder = dressing.policy.signature.memory, dressing.builder
+    if not parts or memory is None or memory.output is None:
+        return
+    whole = row(builder, dressing.own(memory.output), memory.size)
+    start = 0
+    for part in parts:
+        dressing.give(part.given, builder.slice(whole, 1, start, start + part.size), Role.MEMORY_OUT)
+        dressing.kept[part.taken] = part.given
+        start += part.size

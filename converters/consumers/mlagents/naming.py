@@ -46,6 +46,10 @@ class Dressing:
     branches: tuple[int, ...] = ()
     #: input → what is done to a camera's image before it is fed
     images: dict[str, object] = field(default_factory=dict)
+    #: memories that the consumer's runtime carries by itself: input → output
+    kept: dict[str, str] = field(default_factory=dict)
+    #: what is taken from the scores of a forbidden action; by default as the torch exporter does it (0.22 on)
+    forbidden: float = 1e8
 
     def __post_init__(self) -> None:
         self.builder = Builder(NameScope(n.name for n in self.policy.graph.nodes))
@@ -79,6 +83,7 @@ class Dressing:
         """
         graph = self.policy.graph
         noise = {self.policy.feeds[s.name]: s for s in self.policy.signature.noise}
+        noise = {placeholder: spec for placeholder, spec in noise.items() if placeholder not in self.tensors}
         self.notes.extend(f"{spec.name} is drawn inside the model, new at every step" for spec in noise.values())
         behind: set[str] = set(noise)
         later = []
@@ -116,11 +121,17 @@ class Dressing:
         self.fetches[name] = pinned
         self.outputs.append(TensorSpec(name, role, kind.dtype.name, static_shape(kind.shape) or (None,), source))
 
-    def finish(self, memory: Memory | None, beside: Sequence[Node] = ()) -> Policy:
-        """The policy in the consumer's names; ``beside`` are nodes that nothing reads and the consumer looks up."""
-        graph = self.builder.graph().prune(self.fetches.values())
+    def finish(self, memory: Memory | None, beside: Sequence[Node] = (), *, unread: bool = False) -> Policy:
+        """The policy in the consumer's names; ``beside`` are nodes that nothing reads and the consumer looks up.
+
+        ``unread``: inputs that nothing reads stay, as the consumer looks for them (masks of a single action).
+        """
+        made = self.builder.graph()
+        graph = made.prune(self.fetches.values())
         work, fetches = drop_identities(fold(graph).prune(self.fetches.values()), self.fetches)
         work, fetches = cancel_transposes(*collapse_views(work, fetches))
+        if unread:
+            work = Graph((*(made[node] for node in self.feeds.values() if node not in work), *work.nodes))
         feeds = {name: node for name, node in self.feeds.items() if node in work}
         work = name_tensors(work, feeds, fetches, (*self.constants, *(n.name for n in beside)))
         signature = replace(
@@ -149,6 +160,7 @@ class Dressing:
                 noise_kept=bool(self.policy.signature.noise),
             ),
             dict(self.constants),
+            dict(self.kept),
         )
 
 

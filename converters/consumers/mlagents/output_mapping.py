@@ -15,8 +15,6 @@ from signatures.roles import ACTION_NAMES, Role
 from signatures.spec import TensorSpec
 
 _DISCRETE = (Role.SAMPLED, Role.LOG_PROBS, Role.PROBS, Role.DETERMINISTIC)
-#: What is taken from the scores of a forbidden action, as the torch exporter does it (networks.py, 0.22 on).
-_FORBIDDEN = 1e8
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +125,7 @@ def _scores_of_best(dressing: Dressing, score: str) -> str:
     builder = dressing.builder
     best = builder.add("Equal", [score, builder.reduce("Max", score, [1], keep=True)], "is_best")
     other = builder.add("Sub", [builder.cast(best, FLOAT32), builder.floats(1.0, "one")])
-    return builder.add("Mul", [other, builder.floats(_FORBIDDEN)], "settled")
+    return builder.add("Mul", [other, builder.floats(dressing.forbidden)], "settled")
 
 
 def _best(dressing: Dressing, score: str) -> str:
@@ -148,7 +146,9 @@ def _mask_scores(dressing: Dressing, score: str, masks: str, at: int, size: int)
     """Scores of which those of forbidden actions are far below all others; nothing is changed where all are allowed."""
     builder = dressing.builder
     own = builder.slice(masks, 1, at, at + size)
-    away = builder.add("Mul", [builder.add("Sub", [own, builder.floats(1.0, "allowed")]), builder.floats(_FORBIDDEN)])
+    away = builder.add(
+        "Mul", [builder.add("Sub", [own, builder.floats(1.0, "allowed")]), builder.floats(dressing.forbidden)]
+    )
     return builder.add("Add", [score, away], "masked")
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from converters.consumers.mlagents import input_mapping as feeding
 from converters.consumers.mlagents.memory import action_columns, give_memory, previous_action, take_memory
+from converters.consumers.mlagents.names import ACTION, PREVIOUS, SEQUENCE, VECTOR, VISUAL
 from converters.consumers.mlagents.naming import Dressing
 from converters.consumers.mlagents.output_mapping import (
     Heads,
@@ -35,8 +36,8 @@ class Generation:
     """What tells a generation from the others: names of observations, and what it knows."""
 
     name: str
-    vector: str = "vector_observation"
-    visual: str = "visual_observation_"
+    vector: str = VECTOR
+    visual: str = VISUAL
     masks: bool = False
     branches: bool = False
     #: prev_action is fed
@@ -115,7 +116,7 @@ def _take_previous_action(dressing: Dressing, generation: Generation) -> TensorS
     if not generation.previous:
         return spec
     shape: tuple[int | None, ...] = (None, action_columns(spec)) if generation.branches else (None,)
-    dressing.give_in(spec, dressing.take("prev_action", spec, shape, INT32))
+    dressing.give_in(spec, dressing.take(PREVIOUS, spec, shape, INT32))
     return None
 
 
@@ -123,7 +124,7 @@ def _give_action(dressing: Dressing, generation: Generation, found: Heads, masks
     """Give ``action``; returns its width: continuous actions, or the sum of branches."""
     if found.continuous is not None:
         drawn, _, width = continuous_rows(dressing, found.continuous)
-        dressing.give("action", drawn, Role.CONTINUOUS, found.continuous.source)
+        dressing.give(ACTION, drawn, Role.CONTINUOUS, found.continuous.source)
         return width
     spec: TensorSpec | None = found.discrete
     if spec is None:
@@ -136,10 +137,10 @@ def _give_action(dressing: Dressing, generation: Generation, found: Heads, masks
             fix="use a project of 0.5 or later (--for tfsharp-0.5)",
         )
     if generation.version is not None:
-        dressing.give("action", log_probabilities(dressing, spec, scores), Role.LOG_PROBS, spec.source)
+        dressing.give(ACTION, log_probabilities(dressing, spec, scores), Role.LOG_PROBS, spec.source)
     else:
         role = Role.DETERMINISTIC if spec.role is Role.DETERMINISTIC else Role.SAMPLED
-        dressing.give("action", samples(dressing, scores)[0], role, spec.source)
+        dressing.give(ACTION, samples(dressing, scores)[0], role, spec.source)
     return sum(scores.sizes)
 
 
@@ -157,5 +158,5 @@ def _lookup_nodes(generation: Generation, found: Heads, width: int, size: int) -
         }
     nodes = [Node(name, "Const", value=np.array(value, np.int32)) for name, value in constants.items()]
     if size and generation.memory_constant and generation.version is None:
-        nodes.append(Node("sequence_length", "Placeholder", attrs={"dtype": INT32, "shape": TensorShape(())}))
+        nodes.append(Node(SEQUENCE, "Placeholder", attrs={"dtype": INT32, "shape": TensorShape(())}))
     return nodes

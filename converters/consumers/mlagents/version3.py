@@ -13,13 +13,13 @@ import numpy as np
 
 from converters.consumers.mlagents import input_mapping as feeding
 from converters.consumers.mlagents.memory import give_memory, previous_action, take_memory
+from converters.consumers.mlagents.names import CONTINUOUS, DETERMINISTIC, DISCRETE
 from converters.consumers.mlagents.naming import Dressing
 from converters.consumers.mlagents.output_mapping import branches, continuous_rows, heads, samples
 from converters.policy.policy import Policy
 from signatures.roles import CONTINUOUS_SHAPE, DISCRETE_SHAPE, MEMORY_SIZE, VERSION_NUMBER, Role
 
 _VERSION = 3
-_DETERMINISTIC = "deterministic_"
 
 
 def dress(policy: Policy, profile: str, *, feeds_previous: bool = True, transposes_buffers: bool = False) -> Policy:
@@ -45,17 +45,17 @@ def dress(policy: Policy, profile: str, *, feeds_previous: bool = True, transpos
     if found.continuous is not None:
         drawn, without, width = continuous_rows(dressing, found.continuous)
         dressing.constants[CONTINUOUS_SHAPE] = np.array([width], np.float32)
-        dressing.give("continuous_actions", drawn, Role.CONTINUOUS, found.continuous.source)
-        plain.append(("continuous_actions", without))
+        dressing.give(CONTINUOUS, drawn, Role.CONTINUOUS, found.continuous.source)
+        plain.append((CONTINUOUS, without))
     if found.discrete is not None:
         scores = branches(dressing, found.discrete, masks)
         drawn, best = samples(dressing, scores)
         role = Role.DETERMINISTIC if found.discrete.role is Role.DETERMINISTIC else Role.SAMPLED
         dressing.constants[DISCRETE_SHAPE] = np.array([scores.sizes], np.float32)
-        dressing.give("discrete_actions", drawn, role, found.discrete.source)
-        plain.append(("discrete_actions", best))
+        dressing.give(DISCRETE, drawn, role, found.discrete.source)
+        plain.append((DISCRETE, best))
     for name, without in plain:  # behind the actions, which a signature has first
-        dressing.give(f"{_DETERMINISTIC}{name}", without, Role.DETERMINISTIC)
+        dressing.give(f"{DETERMINISTIC}{name}", without, Role.DETERMINISTIC)
     return dressing.finish(give_memory(dressing, state, _rows))
 
 

@@ -6,16 +6,10 @@ import contextlib
 import re
 from collections.abc import Sequence
 
+from converters.consumers.mlagents.names import EPSILON, MASKS, PREVIOUS, RECURRENT_IN, SEQUENCE, VECTOR
 from converters.consumers.unity.findings import UnityThrows
-from converters.consumers.unity.model import (
-    FIRST_VERSION,
-    RECURRENT_IN,
-    CheckedModel,
-    InputView,
-    truncate,
-)
+from converters.consumers.unity.model import FIRST_VERSION, CheckedModel, InputView, truncate
 from converters.consumers.unity.onnx_file import OnnxFile
-from converters.consumers.unity.rules import EPSILON, MASKS, PREVIOUS, SEQUENCE, VECTOR
 from converters.consumers.unity.settings import Brain, sensors_of
 from converters.formats.barracuda.format import NnModel, four_axes
 from signatures.roles import DISCRETE_SHAPE, VERSION_NUMBER

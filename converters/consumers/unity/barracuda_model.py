@@ -13,16 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from converters.consumers.mlagents.names import ACTION, CONTINUOUS, DISCRETE
 from converters.consumers.unity.consumers import Consumer
 from converters.consumers.unity.findings import Thrown, UnityThrows, null_reference
-from converters.consumers.unity.model import (
-    ACTION,
-    CONTINUOUS,
-    DISCRETE,
-    CheckedModel,
-    InputView,
-    truncate,
-)
+from converters.consumers.unity.model import CheckedModel, InputView, truncate
 from converters.consumers.unity.onnx_file import Dims, OnnxFile, attributes
 from converters.formats.barracuda.format import NnModel, four_axes
 from signatures.records import dataclass

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
+from converters.consumers.mlagents.names import ACTION, CONTINUOUS
 from converters.consumers.unity.layout import reads_flat
-from converters.consumers.unity.model import ACTION, CONTINUOUS
 from converters.consumers.unity.scene import Port, Scene
 from signatures.roles import MEMORY_SIZE
 

@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from converters.consumers.mlagents.names import RECURRENT_IN
 from converters.consumers.unity.consumers import Consumer, Engine
 from converters.consumers.unity.findings import Thrown, null_reference
-from converters.consumers.unity.model import RECURRENT_IN
 from converters.consumers.unity.onnx_file import OnnxFile, attributes
 from converters.consumers.unity.readings import ELEMENTWISE
 

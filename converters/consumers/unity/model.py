@@ -7,6 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from converters.consumers.mlagents.names import ACTION, CONTINUOUS, DETERMINISTIC, DISCRETE, RECURRENT_OUT
 from signatures.records import dataclass
 from signatures.roles import (
     ACTION_SHAPE,
@@ -15,9 +16,6 @@ from signatures.roles import (
     IS_CONTINUOUS,
 )
 
-ACTION, CONTINUOUS, DISCRETE = "action", "continuous_actions", "discrete_actions"
-DETERMINISTIC = "deterministic_"
-RECURRENT_IN, RECURRENT_OUT = "recurrent_in", "recurrent_out"
 #: Lowest and highest API version that release 17 and later load.
 FIRST_VERSION, LAST_VERSION = 2, 3
 _MOST_NEGATIVE = -(1 << 31)

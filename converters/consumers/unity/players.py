@@ -11,24 +11,28 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from enum import StrEnum
 
-from converters.consumers.unity import forms
-from converters.consumers.unity.consumers import CONSUMERS, Engine
-from converters.consumers.unity.model import (
+from converters.consumers.mlagents.names import (
     ACTION,
     CONTINUOUS,
     DETERMINISTIC,
     DISCRETE,
+    EPSILON,
+    MASKS,
+    PREVIOUS,
     RECURRENT_IN,
     RECURRENT_OUT,
+    SEQUENCE,
+    VALUE,
 )
-from converters.consumers.unity.rules import EPSILON, MASKS, PREVIOUS, SEQUENCE
+from converters.consumers.unity import forms
+from converters.consumers.unity.consumers import CONSUMERS, Engine
 from converters.consumers.unity.scene import Port, Scene
 from signatures.records import dataclass
 from signatures.roles import MEMORY_SIZE
 
 #: Every observation that one of the agent's sensors is written into; every input but those of one number.
 OBSERVATION, ANY = "(observation)", "(any input)"
-BATCH, VALUE = "batch_size", "value_estimate"
+BATCH = "batch_size"
 #: Inputs that a player fills without a sensor.
 FED = frozenset({MASKS, PREVIOUS, RECURRENT_IN, EPSILON, SEQUENCE, BATCH, VALUE})
 ONE_NUMBER = frozenset({SEQUENCE, BATCH})

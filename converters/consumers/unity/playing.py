@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+from converters.consumers.mlagents.names import ACTION, CONTINUOUS, DISCRETE, RECURRENT_OUT
 from converters.consumers.unity.findings import Thrown
 from converters.consumers.unity.forms import fields
 from converters.consumers.unity.layers import trips
-from converters.consumers.unity.model import ACTION, CONTINUOUS, DISCRETE, RECURRENT_OUT
 from converters.consumers.unity.players import ANY, FED, OBSERVATION, ONE_NUMBER, PLAYERS, UNKNOWN, Outcome, Player, Row
 from converters.consumers.unity.rules import culture_key
 from converters.consumers.unity.scene import Port, Scene

@@ -8,16 +8,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
-from converters.consumers.unity.consumers import Checks, Consumer
-from converters.consumers.unity.findings import Finding, Severity, warning
-from converters.consumers.unity.model import (
+from converters.consumers.mlagents.names import (
     ACTION,
     CONTINUOUS,
     DETERMINISTIC,
     DISCRETE,
+    EPSILON,
+    MASKS,
+    PREVIOUS,
+    RECURRENT_IN,
+    SEQUENCE,
+    VECTOR,
+    VISUAL,
+)
+from converters.consumers.unity.consumers import Checks, Consumer
+from converters.consumers.unity.findings import Finding, Severity, warning
+from converters.consumers.unity.model import (
     FIRST_VERSION,
     LAST_VERSION,
-    RECURRENT_IN,
     CheckedModel,
     InputView,
     action_output,
@@ -26,8 +34,6 @@ from converters.consumers.unity.model import (
 from converters.consumers.unity.settings import Brain, Sensor
 from signatures.roles import ACTION_SHAPE, CONTINUOUS_SHAPE, DISCRETE_SHAPE, IS_CONTINUOUS, MEMORY_SIZE, VERSION_NUMBER
 
-VECTOR, VISUAL = "vector_observation", "visual_observation_"
-MASKS, PREVIOUS, EPSILON, SEQUENCE = "action_masks", "prev_action", "epsilon", "sequence_length"
 _PACKAGE = "com.unity.ml-agents"
 _ACTION_OUTPUTS = (ACTION, CONTINUOUS, DISCRETE, DETERMINISTIC + CONTINUOUS, DETERMINISTIC + DISCRETE)
 #: Inputs that ML-Agents can feed without a sensor, and of which it looks at nothing.

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 
+from converters.consumers.mlagents.names import VECTOR, VISUAL
 from converters.consumers.unity.consumers import Consumer, Engine
 from converters.consumers.unity.model import FIRST_VERSION, CheckedModel, InputView
 from converters.consumers.unity.onnx_file import Dims, OnnxFile
-from converters.consumers.unity.rules import VECTOR, VISUAL, observation
+from converters.consumers.unity.rules import observation
 from converters.consumers.unity.settings import Brain
 from converters.formats.barracuda.format import NnModel
 from signatures.records import dataclass

@@ -16,16 +16,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from converters.consumers.mlagents.names import CONTINUOUS, DISCRETE
 from converters.consumers.unity.barracuda_model import trim_index
 from converters.consumers.unity.consumers import Consumer
 from converters.consumers.unity.findings import Thrown, UnityThrows, null_reference
-from converters.consumers.unity.model import (
-    CONTINUOUS,
-    DISCRETE,
-    CheckedModel,
-    InputView,
-    truncate,
-)
+from converters.consumers.unity.model import CheckedModel, InputView, truncate
 from converters.consumers.unity.onnx_file import Dims, OnnxFile, attributes
 from signatures.records import dataclass
 from signatures.roles import ACTION_SHAPE, CONTINUOUS_SHAPE, DISCRETE_SHAPE, IS_CONTINUOUS, MEMORY_SIZE, VERSION_NUMBER

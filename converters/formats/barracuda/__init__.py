@@ -9,11 +9,10 @@ from converters.formats.format import Format, defer_imports
 
 if TYPE_CHECKING:
     from converters.files.file_probe import Content
-    from converters.formats.barracuda import answers as _answers
     from converters.formats.barracuda import source as _source
     from converters.formats.barracuda import writer as _writer
 else:
-    _answers, _source, _writer = defer_imports(__name__, "answers", "source", "writer")
+    _source, _writer = defer_imports(__name__, "source", "writer")
 
 
 #: Versions of the format, an int64 at its beginning.
@@ -34,8 +33,7 @@ FORMATS = (
         main="{name}.nn",
         held=_writer.embedded_contract,
         runtimes=("numpy",),
-        answers=_answers.answered_outputs,
-        kernels=_answers.kernels,
         elsewhere="Unity",
+        consumer="barracuda-1.0",
     ),
 )

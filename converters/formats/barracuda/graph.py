@@ -17,7 +17,7 @@ from converters.formats.barracuda.format import EIGHT_AXES, Layer, NnInput, NnMo
 from converters.formats.barracuda.layer_builder import MAX_ELEMENTS, LayerBuilder, Value, node_name
 from converters.formats.barracuda.layers import check_bypassed, translate
 from converters.formats.barracuda.slices import upstream
-from converters.formats.barracuda.vocabulary import LayerType
+from converters.formats.barracuda.vocabulary import LayerType, draws_in_model
 from converters.graph.nodes import Graph, NameScope
 from converters.graph.types import FLOAT32, INT32, INT64
 from signatures.errors import DamagedFileError, ExportModelError, SignatureError
@@ -26,8 +26,6 @@ from signatures.roles import ACTION_NAMES, ACTION_SHAPE, OUTPUT_NAMES, VERSION_N
 
 MEMORY_IN, MEMORY_OUT = "recurrent_in", "recurrent_out"
 _INTEGER_INPUTS = ("prev_action",)
-#: The ``version_number`` from which on classes are drawn in the model and memories are inputs and outputs.
-_DRAWS = 3
 _CLASSES = ("discrete_actions", "deterministic_discrete_actions")
 _INTEGER_ROLES = (Role.ACTION, Role.DETERMINISTIC)
 
@@ -64,7 +62,7 @@ class _Reader:
         #: what could not be translated, and is read by nothing that is needed so far
         self.failed: dict[str, ExportModelError] = {}
         self.needed = _upstream(model, self.layers)
-        self.draws = (model.number(VERSION_NUMBER) or 0) >= _DRAWS
+        self.draws = draws_in_model(model.number(VERSION_NUMBER) or 0)
 
     def read(self) -> Reading:
         memories = {m.input for m in self.model.memories}

@@ -20,8 +20,6 @@ from converters.graph.types import BATCH
 
 #: A first pad of −1 is TensorFlow's SAME.
 _SAME = (-1,)
-#: Lower than every score that a policy gives another action, and e to the power of it is 0.
-FORBIDDEN = -1e4
 
 
 # ------------------------------------------------------------------ products
@@ -227,15 +225,6 @@ def softmax(b: NnBuilder, args: Sequence[Value]) -> Value:
         raise b.nn_error(f"a tensor of shape {list(value.shape)}", "Barracuda up to 1.4 takes a whole row")
     x = b.flatten_if_due(value)
     return b.layer_value(b.activation(kind, b.rows(x)), x.shape, x.axes)
-
-
-def best_score(b: NnBuilder, x: str, width: int, label: str) -> str:
-    """0 at the largest number of a row, ``FORBIDDEN`` elsewhere: what a sampler draws from is then sure."""
-    if width == 1:
-        return b.scale(x, 0, label)
-    top = b.layer(LayerType.REDUCE_MAX, [x], (b.dims_of(x)[N], 1, 1, 1), label=f"{label}/largest")
-    below = b.two(LayerType.SUB, x, b.spread(top, width), f"{label}/below")
-    return b.two(LayerType.MAX, b.scale(below, 1e30, f"{label}/steep"), b.number(FORBIDDEN), label)
 
 
 def arg_best(b: NnBuilder, args: Sequence[Value]) -> Value:

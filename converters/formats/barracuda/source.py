@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 from converters.files.fetch import Fetched
-from converters.formats.barracuda.answers import contract_of
 from converters.formats.barracuda.format import NnModel, parse
 from converters.formats.barracuda.graph import to_graph
 from converters.formats.barracuda.slices import with_slices
-from converters.formats.barracuda.writer import PRODUCER
+from converters.formats.barracuda.writer import PRODUCER, contract_of
 from converters.formats.source import ReadOptions, SourceModel
 from converters.policy.facts import SourceFacts
 from signatures.contract import EMBEDDED

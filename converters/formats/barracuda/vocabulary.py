@@ -184,6 +184,15 @@ N, H, W, C = range(4)
 EIGHT = (2, 5, 6, 7)
 
 
+#: The ``version_number`` from which on classes are drawn in the model and memories are inputs and outputs.
+_DRAWS_IN_MODEL = 3
+
+
+def draws_in_model(version: float) -> bool:
+    """Whether a model of this API version of ML-Agents draws classes by itself and has its memory as an input."""
+    return version >= _DRAWS_IN_MODEL
+
+
 def layer_label(number: int) -> str:
     """``"Conv2D (20)"``-like words for a layer's type."""
     return _label(LayerType, number)

@@ -27,7 +27,10 @@ from converters.formats.barracuda.format import (
 from converters.formats.barracuda.lower import policy_model
 from converters.formats.format import WriteOptions
 from converters.policy.policy import Policy
-from signatures.contract import EMBEDDED
+from signatures.contract import EMBEDDED, json_of, parse_signature
+from signatures.errors import DamagedFileError
+from signatures.fields import Field, FieldError
+from signatures.spec import PolicySignature
 
 #: What Barracuda has for a model that no file was imported for.
 _NO_SOURCE, _NO_VERSION = "Script", "NA"
@@ -43,6 +46,18 @@ def write(policy: Policy, options: WriteOptions) -> Mapping[str, Pieces]:
 def embedded_contract(path: Path) -> str:
     """The contract that a ``.nn`` carries, empty where it has none. Raises OSError, DamagedFileError."""
     return parse(path.read_bytes()).metadata(EMBEDDED) or ""
+
+
+def contract_of(model: NnModel) -> PolicySignature:
+    """The contract that the writer left in the file. Raises DamagedFileError where there is none."""
+    try:
+        return parse_signature(Field(json_of(model.metadata(EMBEDDED) or "")))
+    except FieldError as error:
+        raise DamagedFileError(
+            "the .nn carries no contract of export-model",
+            why="only files of this tool say which input and output is which",
+            fix="export it: export-model FILE.nn",
+        ) from error
 
 
 def encode(model: NnModel) -> bytes:

@@ -28,7 +28,6 @@ FORMATS = (
         inner=_artifact.inner,
         unity=True,
         graph=_artifact.graph,
-        kernels=_artifact.kernels,
         runtimes=("numpy", "tensorflow", "tf1.4", "tf1.7"),
     ),
 )

@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,14 +16,12 @@ from converters.files import tensorflow_messages as schema
 from converters.files.external_data import Detached
 from converters.files.fetch import read_bytes
 from converters.files.memory_mapped import Mapped
-from converters.formats.bundle.embed import runnable
-from converters.formats.format import Kernels, Port, Ports
+from converters.formats.format import Port, Ports
 from converters.formats.frozen_graph.reader import from_graph_def, read_graph
 from converters.formats.frozen_graph.subgraph import subgraph
 from converters.formats.intermediate_tensors import Feeds, InnerTensors, Loaded, own_names
 from converters.graph.nodes import Graph, node_of
 from converters.graph.ops.table import is_fed
-from converters.graph.run import run_graph
 
 
 def ports(path: Path) -> Ports:
@@ -38,11 +35,6 @@ def ports(path: Path) -> Ports:
 def graph(path: Path) -> Graph:
     """The graph of a file. Raises SourceError, DamagedFileError, GraphError."""
     return read_graph(path.read_bytes())
-
-
-def kernels(path: Path) -> Kernels:
-    """A ``.bytes`` of ours, run by the numpy kernels. Raises SourceError and its like, GraphError."""
-    return partial(run_graph, runnable(graph(path)))
 
 
 def inner(loaded: Loaded) -> AbstractContextManager[InnerTensors]:

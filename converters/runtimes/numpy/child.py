@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from converters.consumers.named_files import kernels
 from converters.files.children.child import claim_stdout, serve
 from converters.files.children.frames import Tensors
 from converters.formats.bundle.embed import runnable
@@ -40,11 +41,14 @@ def _load(header: Mapping[str, Any]) -> _Model:
     reseed(int(header.get("seed", 0)))
     path = Path(header["path"])
     form = WRITTEN[header["format"]] if "format" in header else FROZEN_GRAPH
-    return _Model(partial(run_graph, _read_back(path, form)) if form.kernels is None else form.kernels(path))
+    named = kernels(form, path)
+    return _Model(partial(run_graph, runnable(_graph(path, form))) if named is None else named)
 
 
-def _read_back(path: Path, form: Format) -> Graph:
-    """The graph of an artefact in a format that no other runtime runs, as its own reader gives it."""
+def _graph(path: Path, form: Format) -> Graph:
+    """The graph of an artefact: of one in a format that no other runtime runs, as its own reader gives it."""
+    if form.graph is not None:
+        return form.graph(path)
     from converters.compiler.compile import compile_graph
     from converters.files.fetch import Fetched
     from converters.formats.source import ReadOptions
@@ -52,7 +56,7 @@ def _read_back(path: Path, form: Format) -> Graph:
     assert form.read is not None, f"{form.key} is not read"
     (model,) = form.read(Fetched(path), ReadOptions())
     (policy,) = compile_graph(model.graph, "policy", None, model.facts)
-    return runnable(policy.graph)
+    return policy.graph
 
 
 def main() -> None:
