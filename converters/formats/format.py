@@ -174,8 +174,8 @@ class Format:
       those of their bundle are. ``narrow``: it can hold weights in
       float16 or int8. ``fixed``: it can be written for a fixed number of agents.
       ``library`` is a Python package that runs such a file by itself; verification does not ask it.
-      ``program``: it is source code, which is run right after it was written and never again, since anyone may have
-      changed it.
+      ``program``: it is source code; one that was not written just now is run only where its process is confined, since
+      anyone may have changed it.
     """
 
     key: str

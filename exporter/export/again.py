@@ -12,6 +12,7 @@ import numpy as np
 from converters.files.folders import scratch_folder
 from converters.formats.bundle.bundle import Bundle, unfit
 from converters.formats.bundle.embed import runnable
+from converters.formats.programs.artifact import can_confine
 from converters.formats.registry import FROZEN_GRAPH, WRITTEN
 from converters.formats.saved_model.writer import signatures_of
 from converters.formats.source import NO_NORMALISER, OriginalRun, ReadOptions
@@ -83,8 +84,8 @@ def verify_folder(
         if each.held is not None:
             with naming(artefacts[each.key]):
                 found.verify_contract(each.held(artefacts[each.key]))
-    programs = [f.key for f in formats if f.program]
-    formats = [f for f in formats if not f.program] or formats
+    programs = [] if can_confine() else [f.key for f in formats if f.program]
+    formats = [f for f in formats if f.key not in programs] or formats
     artefacts = {f.key: artefacts[f.key] for f in formats}
     names = [s.name for s in (*signature.inputs, *signature.outputs)]
     if FROZEN_GRAPH.key in artefacts:
@@ -133,7 +134,10 @@ def verify_folder(
             under = own_in(again, formats, scratch / "own")
             report = join_reports(report, verify(under, used or ("numpy",), known, pool, None, progress))
     if programs:
-        note = f"not compiled again: {', '.join(programs)}: source code may be any program, its bytes were compared"
+        note = (
+            f"not compiled again: {', '.join(programs)}: source code may be any program, and nothing confines "
+            "one here; its bytes were compared"
+        )
         report = replace(report, notes=(*report.notes, note))
     if asked:
         note = (

@@ -23,7 +23,6 @@ from converters.runtimes.c import COMPILERS, compiler
 from converters.runtimes.c.child import FLAGS
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.registry import available_runtimes
-from exporter.api import verify_bundle
 from exporter.export.pipeline import ExportOptions, export
 from exporter.export.sources import read_source
 from exporter.reports.summary import failure_lines
@@ -139,14 +138,6 @@ def test_an_index_outside_of_its_table_is_an_error(index: int, processes: Runtim
         runtimes.program("c", policy, feeds)
     with pytest.raises(RunFailedError, match=rf"indices\[0\] = {index} is not in \[0, 3\)"):
         runtimes.tensorflow(policy.graph, feeds, ["row"])
-
-
-def test_a_header_in_a_bundle_is_not_compiled_again(tmp_path: Path, here: RuntimePool) -> None:
-    """Anyone may have made it: its bytes are compared, and the report says so."""
-    (result,) = export([path("continuous")], ExportOptions(tmp_path, ("bytes", "c"), verify="none"), pool=here)
-    report = verify_bundle(result.folder, allow_unverified=True)
-    assert any("not compiled again: c" in note for note in report.notes)
-    assert "c" not in {c.format for c in report.comparisons}
 
 
 def test_no_name_of_a_source_leaves_its_comment(tmp_path: Path, here: RuntimePool) -> None:

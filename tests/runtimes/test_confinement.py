@@ -56,12 +56,26 @@ ATTEMPTS = {
 }
 
 
-#: A child in Python gives up by itself, for other programs another does (confinement.py).
-OURS, OTHERS = "a child of ours", "another program"
+#: A child in Python gives up by itself, for other programs another does (confinement.py); a compiler is started by one.
+OURS, OTHERS, COMPILER = "a child of ours", "another program", "a compiler"
+#: A compiler starts its parts, and may ask whether what started it, which is confined with it, is alive.
+OF_COMPILERS = {"start a process", "start a program", "signal its parent"}
+STARTING = """
+import sys
+from pathlib import Path
+from converters.files.children import bounded, confinement
+confinement.confine({scratch!r}, starts=True)
+done = bounded.run_bounded([sys.executable, "-c", {code!r}], Path({scratch!r}), 1 << 30, 20)
+sys.stderr.write(done.stderr)
+sys.exit(done.returncode)
+"""
 
 
 def tried(code: str, scratch: Path, way: str = OURS) -> subprocess.CompletedProcess[bytes]:
     command = [sys.executable, "-c", code]
+    if way == COMPILER:
+        command[2] = STARTING.format(scratch=str(scratch), code=code)
+        return subprocess.run(command, capture_output=True, check=False)
     if way == OURS:
         *start, program = child_command("x")
         command = [*start, program.partition("import runpy")[0] + code]
@@ -70,8 +84,10 @@ def tried(code: str, scratch: Path, way: str = OURS) -> subprocess.CompletedProc
     return subprocess.run(done, capture_output=True, check=False)
 
 
-@pytest.mark.parametrize("way", [OURS, OTHERS])
-@pytest.mark.parametrize("name", ATTEMPTS)
+@pytest.mark.parametrize(
+    ("name", "way"),
+    [(n, way) for way in (OURS, OTHERS, COMPILER) for n in ATTEMPTS if way != COMPILER or n not in OF_COMPILERS],
+)
 def test_it_cannot(name: str, way: str, tmp_path: Path) -> None:
     outside, scratch = tmp_path / "outside", tmp_path / "scratch"
     outside.mkdir()
@@ -97,8 +113,9 @@ def test_it_cannot(name: str, way: str, tmp_path: Path) -> None:
         "import threading; t = threading.Thread(target=print); t.start(); t.join()",
     ],
 )
-def test_it_can(code: str, tmp_path: Path) -> None:
-    done = tried(code.format(scratch=str(tmp_path)), tmp_path)
+@pytest.mark.parametrize("way", [OURS, COMPILER])
+def test_it_can(code: str, way: str, tmp_path: Path) -> None:
+    done = tried(code.format(scratch=str(tmp_path)), tmp_path, way)
     assert done.returncode == 0, done.stderr.decode()
 
 

@@ -105,17 +105,23 @@ def in_force() -> dict[str, bool]:
 
 def begin(scratch: str, parent: int) -> None:
     """The first act of a child: confined to ``scratch``, it is killed with ``parent`` (0: it looks by itself)."""
-    if parent and sys.platform == "linux":
+    if parent:
+        end_with(parent)
+    confine(scratch)
+
+
+def end_with(parent: int) -> None:
+    """Let the kernel kill this process when its parent ends; end now where it has ended. Linux only."""
+    if sys.platform == "linux":
         _libc().prctl(_SET_PDEATHSIG, _SIGKILL, 0, 0, 0)
         if os.getppid() != parent:  # it was killed before this line
             os._exit(1)
-    confine(scratch)
 
 
 def confine(scratch: str | None, *, starts: bool = False) -> None:
     """Give up everything but reading, computing, and writing below ``scratch``; what a kernel lacks is left out.
 
-    ``starts``: a compiler, which may start processes; they give up the same.
+    ``starts``: it starts programs, and refuses system calls for each of them (``refuse_calls``), not for itself.
     """
     limit()
     if sys.platform != "linux":
@@ -123,7 +129,7 @@ def confine(scratch: str | None, *, starts: bool = False) -> None:
     _libc().prctl(_SET_NO_NEW_PRIVS, 1, 0, 0, 0)
     _landlock(scratch)
     if not starts:
-        _seccomp()
+        refuse_calls()
 
 
 def limit() -> None:
@@ -175,13 +181,18 @@ def _landlock(scratch: str | None) -> None:
         os.close(rules)
 
 
-def _seccomp() -> None:
-    """Refuse the system calls of ``_REFUSED``, and to start processes or to set limits; threads go on."""
-    known = _MACHINES.get(os.uname().machine)
+def refuse_calls(*, starts: bool = False) -> None:
+    """Refuse the system calls of ``_REFUSED``, and to start processes or to set limits; threads go on.
+
+    ``starts``: a compiler, which may start processes; they give up the same.
+    """
+    known = _MACHINES.get(os.uname().machine) if sys.platform == "linux" else None
     if known is None:
         return
     machine, column = known
-    program = _program(machine, [n for row in _REFUSED.values() for n in row[column]], _ASKED[column])
+    refused = [n for what, row in _REFUSED.items() if not (starts and what == "processes") for n in row[column]]
+    program = _program(machine, refused, _ASKED[column], starts=starts)
+    _libc().prctl(_SET_NO_NEW_PRIVS, 1, 0, 0, 0)  # without which only root may
     steps = ctypes.create_string_buffer(program)
 
     class Program(ctypes.Structure):
@@ -197,7 +208,7 @@ _Step = tuple[int, int | str, int | str, int]
 _LOAD, _IF_EQUAL, _IF_LEAST, _IF_ANY, _ANSWER = 0x20, 0x15, 0x35, 0x45, 0x06
 
 
-def _program(machine: int, refused: Sequence[int], asked: tuple[int, int, int]) -> bytes:
+def _program(machine: int, refused: Sequence[int], asked: tuple[int, int, int], *, starts: bool) -> bytes:
     """The filter: seccomp_data has the call's number at 0, the machine at 4, its arguments from 16 on, 8 bytes each."""
     clone, clone3, prlimit = asked
     end: list[tuple[str, _Step]] = [  # what the jumps lead to, by name
@@ -217,7 +228,7 @@ def _program(machine: int, refused: Sequence[int], asked: tuple[int, int, int]) 
         ("", (_LOAD, 0, 0, 0)),
         ("", (_IF_LEAST, "refuse", 0, _X32)),
         *(("", (_IF_EQUAL, "refuse", 0, call)) for call in refused),
-        ("", (_IF_EQUAL, "clone", 0, clone)),
+        ("", (_IF_EQUAL, "allow" if starts else "clone", 0, clone)),
         ("", (_IF_EQUAL, "absent", 0, clone3)),
         ("", (_IF_EQUAL, "prlimit", "allow", prlimit)),
     ]

@@ -1,11 +1,13 @@
-"""An artefact that is source code: the contract that it holds, and why an untrusted one is not run."""
+"""An artefact that is source code: the contract that it holds, and where an untrusted one is run."""
 
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
+from converters.files.children.confinement import in_force
 from converters.files.fetch import read_bytes
 from converters.formats.format import Port, Ports
 from converters.formats.programs.members import answers
@@ -41,10 +43,21 @@ def ports(path: Path) -> Ports:
 
 
 def vetted(path: Path, names: Sequence[str], folder: Path) -> Path:
-    """Nothing: source code is a program, and may do more than compute. Raises UnsupportedOpError."""
-    raise UnsupportedOpError(
-        f"{path.name} is not compiled",
-        issues=[],
-        why="a file that was not made just now may hold any program",
-        fix="export the policy again, which verifies it, or compile it yourself and call its self test",
-    )
+    """Return a copy, where its process is confined: it may be any program.
+
+    Raises UnsupportedOpError, DamagedFileError.
+    """
+    if not can_confine():
+        raise UnsupportedOpError(
+            f"{path.name} is not compiled",
+            issues=[],
+            why="a file that was not made just now may hold any program, and nothing confines one here",
+            fix="verify it on Linux 5.13 or later, or export the policy again, which verifies it",
+        )
+    ports(path)
+    return Path(shutil.copyfile(path, folder / path.name))
+
+
+def can_confine() -> bool:
+    """Whether a program that anyone may have made is run here: in a process that only reads, computes and answers."""
+    return all(in_force().values())

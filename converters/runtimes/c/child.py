@@ -9,6 +9,7 @@ from __future__ import annotations
 import ctypes
 import json
 import os
+import resource
 import shutil
 import sys
 import tempfile
@@ -35,6 +36,8 @@ _C_DTYPES = {"bool": "int32"}
 #: text (of weights, gcc 12 and clang 14 take up to 43 bytes and 0.23 µs).
 COMPILER_BYTES, COMPILER_SECONDS = 1 << 30, 30
 _BYTES_PER_BYTE, _SECONDS_PER_BYTE = 200, 4e-6
+#: Bytes of memory that libraries, and what they are fed, may take in this process.
+_MEMORY_BYTES = 4 << 30
 
 
 class CompileError(Exception):
@@ -97,7 +100,7 @@ class _Builder:
         file = self.folder / f"{self.count}.c"
         file.write_text(source, "ascii")
         shutil.copyfile(header, self.folder / "policy.h")
-        self.asked.write(f"{file}\n".encode())
+        self.asked.write(f"{self.count}\n".encode())
         self.asked.flush()
         answer = json.loads(self.answers.readline())
         if answer["rc"]:
@@ -108,7 +111,7 @@ class _Builder:
 def _compile(program: str, folder: Path, asked: BinaryIO, answers: BinaryIO) -> None:
     """Compile what is asked for until nobody asks."""
     for line in asked:
-        file = Path(line.decode().strip())
+        file = folder / f"{int(line)}.c"  # what asks has loaded libraries: no path, and no option, of theirs
         command = [program, *FLAGS, "-o", str(file.with_suffix(".so")), str(file), "-lm"]
         size = (folder / "policy.h").stat().st_size
         done = run_bounded(
@@ -142,6 +145,7 @@ def main() -> None:
     os.close(ask_out)
     os.close(answer_in)
     build = _Builder(folder, os.fdopen(ask_in, "wb"), os.fdopen(answer_out, "rb"))
+    resource.setrlimit(resource.RLIMIT_DATA, (_MEMORY_BYTES, _MEMORY_BYTES))
     confinement.confine(str(folder))
     out = claim_stdout()
 

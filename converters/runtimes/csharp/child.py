@@ -1,7 +1,7 @@
 """C# in its own processes: ``python -m converters.runtimes.csharp.child``.
 
 This one compiles classes and starts a Mono for each; none of them writes outside of a folder of their own, or reaches
-a network. Memory and time of each are bounded.
+a network. Memory, time and system calls of each are bounded.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from converters.files.children import confinement
-from converters.files.children.bounded import bound, run_bounded
+from converters.files.children.bounded import bounds, run_bounded
 from converters.files.children.child import Model, claim_stdout, serve
 from converters.files.children.frames import Tensors
 from converters.formats.programs.artifact import held
@@ -34,6 +34,8 @@ FLAGS = ("-langversion:7", "-warn:4", "-warnaserror", "-optimize+", "-nologo")
 _BYTES, _SECONDS = 2 << 30, 60
 _BYTES_PER_BYTE, _SECONDS_PER_BYTE = 200, 4e-6
 _RUN_SECONDS = 3600
+#: What the answers begin with, and how much Mono may say before.
+_MARK, _MOST_SAID = b"answers:", 1 << 16
 
 
 class CompileError(Exception):
@@ -63,6 +65,7 @@ static class Driver
         agent.Reset(ulong.Parse(words[0]));
         var reader = new System.IO.BinaryReader(System.Console.OpenStandardInput());
         var writer = new System.IO.BinaryWriter(System.Console.OpenStandardOutput());
+        foreach (char c in "{_MARK.decode()}") writer.Write((byte)c);
         writer.Write(wrong);
         writer.Flush();
         var output = new byte[{_bytes(header.answered)}];
@@ -112,10 +115,19 @@ class _Program:
             [mono, str(own / "policy.exe"), str(seed)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            preexec_fn=lambda: bound(_BYTES + size * _BYTES_PER_BYTE, _RUN_SECONDS),
+            preexec_fn=bounds(_BYTES + size * _BYTES_PER_BYTE, _RUN_SECONDS, starts=False),
         )
+        self._skip()
         if wrong := int(np.frombuffer(self._read(4), "<i4")[0]):
             raise ValueError(f"its self test finds {wrong} wrong numbers")
+
+    def _skip(self) -> None:
+        """What Mono itself has to say, such as that it may not change the priority of its threads."""
+        said = b""
+        while not said.endswith(_MARK):
+            said += self._read(1)
+            if len(said) > _MOST_SAID:
+                raise ValueError(f"Mono says {said[:200]!r}")
 
     def _read(self, count: int) -> bytes:
         assert self.process.stdout is not None
