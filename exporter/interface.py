@@ -84,7 +84,7 @@ def export(
         profile=for_,
         weights=storage(write.dtype, write.quantize),
         batch=write.batch,
-        code=code_options(math=write.math),
+        code=code_options(write.math, write.weights, write.outputs, write.guard),
     )
     live = {"session": session, "tf_function": tf_function, "keras_model": keras_model}
     with _sources(source, live, read.step) as sources:

@@ -66,6 +66,11 @@ class WriteOptions:
     batch: int | None = None
     #: Source code computes exp, log, tanh and others by its ``own`` functions, with the same bits everywhere.
     math: str = "library"
+    #: Source code loads its weights from a ``file`` beside it, gives ``all`` outputs, tells of observations that lie
+    #: farther than so many deviations from their mean in training.
+    weights: str = "source"
+    outputs: str = "actor"
+    guard: float | None = None
     #: Names of observations and actions: a file or a mapping.
     labels: Labels | None = None
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math as numbers
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,6 +12,8 @@ from signatures.records import dataclass
 #: Option → what it may say, the usual one first.
 CHOICES: Mapping[str, tuple[str, ...]] = {
     "math": ("library", "own"),
+    "weights": ("source", "file"),
+    "outputs": ("actor", "all"),
 }
 
 
@@ -18,14 +21,20 @@ CHOICES: Mapping[str, tuple[str, ...]] = {
 class CodeOptions:
     """What source code is asked for beside the policy.
 
-    ``math``: the functions of the language's library, or our own, with the same bits on every processor.
+    ``math``: the functions of the language's library, or our own, with the same bits on every processor. ``weights``:
+    in the source, or in a file beside it that is loaded. ``outputs``: the actor's, or all. ``guard``: beyond how many
+    standard deviations of the policy's own normaliser an observation is unusual (None: nobody asks).
     """
 
     math: str = "library"
+    weights: str = "source"
+    outputs: str = "actor"
+    guard: float | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """What is not as usual, as a contract says it."""
-        return {key: value for key in CHOICES if (value := getattr(self, key)) != CHOICES[key][0]}
+        said = {key: value for key in CHOICES if (value := getattr(self, key)) != CHOICES[key][0]}
+        return said if self.guard is None else {**said, "guard": self.guard}
 
     @classmethod
     def of(cls, tool: Mapping[str, Any]) -> CodeOptions:
@@ -33,9 +42,14 @@ class CodeOptions:
         return cls(**tool.get("code", {}))
 
 
-def code_options(**given: Any) -> CodeOptions:
+def code_options(
+    math: str = "library", weights: str = "source", outputs: str = "actor", guard: float | None = None
+) -> CodeOptions:
     """What was asked for. Raises UsageError."""
-    for key, value in given.items():
-        if value not in CHOICES[key]:
-            raise UsageError(f"--{key} {value}", fix=f"one of: {', '.join(CHOICES[key])}")
-    return CodeOptions(**given)
+    options = CodeOptions(math, weights, outputs, guard)
+    for key, words in CHOICES.items():
+        if getattr(options, key) not in words:
+            raise UsageError(f"--{key} {getattr(options, key)}", fix=f"one of: {', '.join(words)}")
+    if guard is not None and not (numbers.isfinite(guard) and guard > 0):
+        raise UsageError(f"--guard {guard:g}", fix="give a number of standard deviations, such as 6")
+    return options

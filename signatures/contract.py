@@ -180,7 +180,8 @@ def parse(content: Any) -> Contract:
 
 def _code(said: Field) -> dict[str, Any]:
     """How source code was written, as far as it is not as usual."""
-    return {key: said[key].one_of(choices) for key, choices in CHOICES.items() if not said[key].missing}
+    words = {key: said[key].one_of(choices) for key, choices in CHOICES.items() if not said[key].missing}
+    return words if said["guard"].missing else {**words, "guard": said["guard"].number()}
 
 
 def parse_signature(whole: Field) -> PolicySignature:

@@ -9,6 +9,7 @@ from converters.formats.format import Artifact, Format, Kernels, WriteOptions
 
 if TYPE_CHECKING:
     from converters.policy.policy import Policy
+    from signatures.code import CodeOptions
     from signatures.spec import PolicySignature
 
 
@@ -24,13 +25,13 @@ def artifact_of(form: Format, policy: Policy, options: WriteOptions) -> Artifact
     return form.artifact(policy, options)
 
 
-def answered_outputs(form: Format, signature: PolicySignature) -> list[str]:
+def answered_outputs(form: Format, signature: PolicySignature, code: CodeOptions) -> list[str]:
     """Return the outputs of a policy that its artefact in a format answers."""
     if form.consumer:
         from converters.consumers.mlagents import own_names
 
         return own_names.answered_outputs(signature)
-    return [s.name for s in signature.outputs] if form.answers is None else form.answers(signature)
+    return [s.name for s in signature.outputs] if form.answers is None else form.answers(signature, code)
 
 
 def kernels(form: Format, path: Path) -> Kernels | None:

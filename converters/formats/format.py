@@ -201,7 +201,7 @@ class Format:
     origins: Callable[[Path], Mapping[str, str]] | None = None
     snippets: tuple[Code, ...] = ()
     dtypes: frozenset[str] = frozenset()
-    answers: Callable[[PolicySignature], list[str]] | None = None
+    answers: Callable[[PolicySignature, CodeOptions], list[str]] | None = None
     graph: Callable[[Path], Graph] | None = None
     elsewhere: str = ""
     unity: bool = False

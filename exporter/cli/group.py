@@ -31,7 +31,7 @@ _RARE = frozenset(("completion", "consumers"))
 GROUPS = {
     "What to write": (
         *("out", "targets", "profile", "name", "names", "noise", "deterministic", "labels", "opset", "logdir", "svg"),
-        *("dtype", "quantize", "batch", "math", "scene", "target", "files"),
+        *("dtype", "quantize", "batch", "math", "weights", "outputs_of", "guard", "scene", "target", "files"),
     ),
     "How to read the source": (
         *("source", "step", "brain", "inputs", "outputs", "values", "mapped", "sensors", "activation"),

@@ -176,13 +176,16 @@ def coding(command: Callable[..., Any]) -> Callable[..., Any]:
     """How source code is written; the command gets it as ``code``, a CodeOptions."""
 
     @functools.wraps(command)
-    def parse_and_call(*args: Any, math: str, **rest: Any) -> Any:
+    def parse_and_call(*args: Any, math: str, weights: str, outputs_of: str, guard: float | None, **rest: Any) -> Any:
         from signatures.code import code_options
 
-        return command(*args, code=code_options(math=math), **rest)
+        return command(*args, code=code_options(math, weights, outputs_of, guard), **rest)
 
     for option in (
-        click.option("--math", metavar="WHOSE", default="library", help="own: the same bits everywhere (source code)."),
+        click.option("--guard", type=float, metavar="K", help="Source code: tell of observations beyond K sigma."),
+        click.option("--outputs", "outputs_of", metavar="WHOSE", default="actor", help="Source code: actor, or all."),
+        click.option("--weights", metavar="PLACE", default="source", help="Source code: weights in a file beside it."),
+        click.option("--math", metavar="WHOSE", default="library", help="Source code: own, the same bits anywhere."),
     ):
         parse_and_call = option(parse_and_call)
     return parse_and_call

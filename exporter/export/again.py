@@ -28,6 +28,7 @@ from exporter.verify.options import VerifyOptions
 from exporter.verify.participants import policy_under_test, write_reference
 from exporter.verify.report import ParityReport
 from exporter.verify.verification import verify
+from signatures.code import CodeOptions
 from signatures.contract import POLICY, Contract, safe_name
 from signatures.errors import BundleError, RuntimeUnavailableError, UsageError, naming
 from signatures.fields import printable
@@ -119,6 +120,7 @@ def verify_folder(
             files=artefacts,
             profile=made_for,
             batch=contract.tool.get("batch"),
+            code=CodeOptions.of(contract.tool),
             runs_elsewhere=read is not None and runs_elsewhere(read),
         )
         weights = contract.tool.get("weights")

@@ -49,6 +49,8 @@ class Job:
     whole: Policy | None = None
     #: for how many agents its files are
     batch: int | None = None
+    #: how its source code is written
+    code: CodeOptions = CodeOptions()
 
 
 def artefacts_of(
@@ -155,6 +157,7 @@ def under_test(job: Job, stage: Path, artifacts: Sequence[Artifact], scratch: Pa
         source=job.model.original if job.own is None and job.whole is None else None,
         profile=None if job.profile is None else job.profile.name,
         batch=job.batch,
+        code=job.code,
         runs_elsewhere=runs_elsewhere(job.source),
     )
 

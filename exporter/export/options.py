@@ -38,7 +38,7 @@ class ExportOptions:
     weights: Storage = "float32"
     #: for how many agents the files are (``--batch``; None: for any number)
     batch: int | None = None
-    #: how source code is written (``--math``)
+    #: how source code is written (``--math``, ``--weights``, ``--outputs``, ``--guard``)
     code: CodeOptions = CodeOptions()
 
 

@@ -180,7 +180,7 @@ class Exporter:
         for (model, policy), (name, note) in zip(found, called, strict=True):
             own = replace(policy, name=name)
             dressed = with_labels(own if dress is None else dress(own), self._labels)
-            job = Job(source, model, dressed, self._profile, None if dress is None else own, note)
+            job = Job(source, model, dressed, self._profile, None if dress is None else own, note, code=options.code)
             job = job if options.batch is None else fix_batch(job, options.batch, self._formats)
             jobs.append(job if options.weights == "float32" else smaller(job, options.weights))
         return jobs

@@ -18,6 +18,7 @@ from converters.graph.nodes import Graph
 from converters.runtimes.pool import FIXED, RuntimePool
 from exporter.verify.findings import Finding
 from signatures.batches import batches_of, put_together, rows_of
+from signatures.code import CodeOptions
 from signatures.records import dataclass
 from signatures.spec import PolicySignature, SourceMap
 
@@ -59,6 +60,8 @@ class PolicyUnderTest:
     files: Mapping[str, Path] = field(default_factory=dict)
     #: for how many agents its artefacts are (None: for any number)
     batch: int | None = None
+    #: how its source code was written
+    code: CodeOptions = CodeOptions()
     #: whether a library that is here runs the source by itself, though verification does not ask it
     runs_elsewhere: bool = False
 
@@ -84,6 +87,7 @@ def policy_under_test(
     files: Mapping[str, Path] | None = None,
     profile: str | None = None,
     batch: int | None = None,
+    code: CodeOptions | None = None,
     runs_elsewhere: bool = False,
 ) -> PolicyUnderTest:
     """Return what is verified of a policy and its ``artefacts`` (format → path that a loader is given).
@@ -107,6 +111,7 @@ def policy_under_test(
         profile=profile,
         files=artefacts if files is None else files,
         batch=batch,
+        code=code or CodeOptions(),
         runs_elsewhere=runs_elsewhere,
     )
 
@@ -168,7 +173,7 @@ def participants_of(
     # The others run while TensorFlow is still being imported; ``in_order`` puts the report right again.
     for kind, runtime in sorted(taking_part, key=lambda pair: pair[1] == _SLOWEST):
         path = tested.artefacts[kind]
-        loads = {"": answered_outputs(WRITTEN[kind], tested.signature)}
+        loads = {"": answered_outputs(WRITTEN[kind], tested.signature, tested.code)}
         if WRITTEN[kind].signatures:
             loads = {key: list(names[1]) for key, names in tested.signatures.items()}
         for key, names in loads.items():

@@ -45,7 +45,7 @@ class Reference(AbstractContextManager["Reference"]):
         #: the outputs that the source answered for
         self._given: frozenset[str] = frozenset()
         #: the outputs that the kernels have
-        self.asked = answered_outputs(WRITTEN[form], self.signature)
+        self.asked = answered_outputs(WRITTEN[form], self.signature, tested.code)
         #: id of inputs → these, and what the kernels answered
         self._known: dict[int, tuple[Arrays, dict[str, np.ndarray]]] = {}
         self._loaded = [self.model]

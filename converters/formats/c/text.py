@@ -11,7 +11,14 @@ from converters.graph.program import Place
 from converters.graph.types import FLOAT32, INT64
 
 #: What C calls a dtype; a truth is an int, as C's comparisons are.
-C_TYPES = {"float32": "float", "int32": "int32_t", "int64": "int64_t", "bool": "int32_t"}
+C_TYPES = {
+    "float32": "float",
+    "int32": "int32_t",
+    "int64": "int64_t",
+    "bool": "int32_t",
+    "int8": "int8_t",
+    "float16": "uint16_t",
+}
 _SAME = ("exp", "expm1", "log", "log1p", "sqrt", "sin", "cos", "tan", "tanh", "erf", "floor", "ceil", "rint")
 #: Functions that a program brings along: what they are for floats, and for whole numbers.
 _HELPERS = {
@@ -28,6 +35,15 @@ _RAW = {
     "bits": ("int32_t b; memcpy(&b, &a, sizeof b); return b;", "float"),
     "of_bits": ("float b; memcpy(&b, &a, sizeof b); return b;", "int32_t"),
 }
+#: The number in 16 bits: sign, 5 bits of exponent, 10 of fraction. One below the least exponent is a whole multiple.
+_HALF = """static float $P_half(uint16_t a)
+{
+    const int32_t rest = a & 0x7FFF, bits = rest * 8192 + 0x38000000;
+    float x;
+    memcpy(&x, &bits, sizeof x);
+    x = rest < 1024 ? (float)rest * 5.9604644775390625e-8f : x;
+    return (a & 0x8000) != 0 ? -x : x;
+}"""
 _SUFFIX = {"float": "f", "int32_t": "i", "int64_t": "l"}
 
 
@@ -64,6 +80,9 @@ class C(Language):
     def cast(self, text: str, source: np.dtype, target: np.dtype) -> str:
         """A number of another dtype; a float outside of an integer's range, which C leaves open, is the least one."""
         kind = C_TYPES[target.name]
+        if source == np.float16:
+            self.helpers[f"{self.prefix}_half"] = _HALF.replace("$P", self.prefix)
+            return f"{self.prefix}_half({bare(text)})"
         if source != FLOAT32 or target == FLOAT32:
             return f"({kind}){text}"
         bits = "63" if target == INT64 else "31"
@@ -108,6 +127,9 @@ class C(Language):
         assert place.value is not None
         value = place.value.reshape(-1)
         plain = place.dtype == FLOAT32 and np.isfinite(value).all()
-        words = numbers(value) if plain else [self.literal(x, place.dtype) for x in value.tolist()]
+        if place.dtype.name in ("int8", "float16"):
+            words = [str(x) for x in (value if value.dtype == np.int8 else value.view(np.uint16)).tolist()]
+        else:
+            words = numbers(value) if plain else [self.literal(x, place.dtype) for x in value.tolist()]
         kind = C_TYPES[place.dtype.name]
         return f"static const {kind} {name}[{max(1, place.size)}] = {{\n    {lines_of(words)}\n}};"

@@ -7,15 +7,24 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from converters.files.chunks import Pieces
+from converters.formats.c.extras import (
+    LOAD_SAID,
+    UNUSUAL_SAID,
+    load_text,
+    places_of,
+    pointers,
+    sizes_text,
+    unusual_text,
+)
 from converters.formats.c.text import C_TYPES, C
 from converters.formats.format import WriteOptions
 from converters.formats.programs.members import Field
 from converters.formats.programs.plan import CLOSE, ROWS, Plan, formula, plan_of
+from converters.formats.programs.weights import weights_name, widen_where_used
 from converters.graph.ops.loops.layers import box_muller, gumbel
 from converters.graph.printer import Printer
 from converters.graph.program import arena_of
 from converters.policy.policy import Policy
-from signatures.code import CodeOptions
 
 _DRAWS = """
 /* The stream of draws: splitmix64 (Steele, Lea and Flood 2014), its top 23 bits, in the middle of their step: above 0,
@@ -56,14 +65,16 @@ _STRICT = """
 
 def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
     """The header. Raises UnsupportedOpError."""
-    text = _text(policy.name, plan_of(policy, options), options.code)
-    return {f"{policy.name}.h": Pieces(text.encode("ascii"))}
+    plan = plan_of(policy, options)
+    file = {} if plan.weights.file is None else {weights_name(policy.name): Pieces(plan.weights.file)}
+    return {f"{policy.name}.h": Pieces(_text(policy.name, plan).encode("ascii")), **file}
 
 
-def _text(name: str, plan: Plan, code: CodeOptions) -> str:
+def _text(name: str, plan: Plan) -> str:
     header, program = plan.header, plan.program
     p, state = header.prefix, header.state
-    words = C(p, code.math == "own")
+    widen_where_used(program, plan.weights)
+    words = C(p, plan.code.math == "own")
     printer = Printer(words, f"{p}_w_")
     by_name = {f.spec.name: f"input->{f.name}" for f in header.inputs}
     by_name |= {f.spec.name: f"memory->{f.name}" for f in header.fed if f not in header.inputs}
@@ -75,6 +86,8 @@ def _text(name: str, plan: Plan, code: CodeOptions) -> str:
         f"    {C_TYPES[at.dtype.name]} *const {printer.name(at)} = memory->{arena_of(at.dtype)} + {at.offset};"
         for at in places
     ]
+    loads = plan.weights.file is not None
+    body = [*(["    if (memory->weights == NULL) return 2;"] if loads else []), *pointers(plan, printer), *body]
     body = [*(["    int outside = 0;"] if printer.looks_up else []), *body, *statements]
     body += ["    if (outside) return 1;"] if printer.looks_up else []
     for f in header.answered:
@@ -91,13 +104,15 @@ def _text(name: str, plan: Plan, code: CodeOptions) -> str:
         f'       #include "{name}.h"\n'
         f"   and link the C library's maths (-lm). C99 or later, C++11 or later. Made by export-model.\n\n"
         f"{plan.contract}",
-        f"#ifndef {p.upper()}_H\n#define {p.upper()}_H\n\n#include <stdint.h>\n\n"
+        f"#ifndef {p.upper()}_H\n#define {p.upper()}_H\n\n#include <stddef.h>\n#include <stdint.h>\n\n"
         f'#ifdef __cplusplus\nextern "C" {{\n#endif',
+        sizes_text(plan),
         _struct(f"{p}_input", "What an agent observes.", map(_member, header.inputs)),
         _struct(
             f"{p}_memory",
             "What an agent keeps: the stream of its draws, its state; the rest is for computing.",
             [
+                *(["const unsigned char *weights;"] if loads else []),
                 "uint64_t stream;",
                 *map(_member, header.noise),
                 *([_member(state)] if state else []),
@@ -109,9 +124,10 @@ def _text(name: str, plan: Plan, code: CodeOptions) -> str:
             ],
         ),
         _struct(f"{p}_output", "What an agent does.", map(_member, header.outputs)),
+        *([LOAD_SAID.replace("$P", p).replace("$FILE", weights_name(name)).strip()] if loads else []),
         f"/* Begin an episode: no state, draws by a seed. */\nvoid {p}_reset({p}_memory *memory, uint64_t seed);\n"
         f"/* Decide: draw the noise where there is some, then compute. 0; 1, and no output, where an observed index\n"
-        f"   lies outside of the table that it is looked up in. */\n"
+        f"   lies outside of the table that it is looked up in{'; 2 before the weights are loaded' * loads}. */\n"
         f"int {p}_act(const {p}_input *input, {p}_memory *memory, {p}_output *output);\n"
         f"/* The same for some agents, each with a memory of its own; how many of them have no output. */\n"
         f"int {p}_act_all(int agents, const {p}_input *input, {p}_memory *memory, {p}_output *output);\n"
@@ -120,16 +136,21 @@ def _text(name: str, plan: Plan, code: CodeOptions) -> str:
         f"#ifdef {p.upper()}_SELFTEST\n"
         f"/* How many numbers are not what the policy's own kernels computed at export: 0. */\n"
         f"int {p}_selftest({p}_memory *memory);\n#endif",
+        *([UNUSUAL_SAID.replace("$P", p).replace("$K", f"{plan.code.guard:g}").strip()] if plan.guarded else []),
         *([f"/* Draw a class for each of {len(sizes)} branches. */\n{choose.splitlines()[0]};"] if choose else []),
         f"#ifdef __cplusplus\n}}\n#endif\n\n#endif\n\n"
         f"#ifdef {p.upper()}_IMPLEMENTATION\n#include <float.h>\n#include <math.h>\n#include <string.h>",
         *([_STRICT.strip()] if words.own else []),
-        *(words.constant(place, printer.name(place)) for place in program.constants),
+        *(words.constant(place, printer.name(place)) for place, offset in places_of(plan) if offset is None),
         *words.helpers.values(),
         *([_DRAWS.replace("$P", p).strip()] if draws else []),
         *([_NORMAL.replace("$P", p).replace("$X", normal).strip()] if header.noise else []),
-        f"void {p}_reset({p}_memory *memory, uint64_t seed)\n{{\n    memset(memory, 0, sizeof *memory);\n"
-        f"    memory->stream = seed;\n}}",
+        *([load_text(plan)] if loads else []),
+        f"void {p}_reset({p}_memory *memory, uint64_t seed)\n{{\n"
+        + ("    const unsigned char *const weights = memory->weights;\n" if loads else "")
+        + "    memset(memory, 0, sizeof *memory);\n"
+        + ("    memory->weights = weights;\n" if loads else "")
+        + "    memory->stream = seed;\n}",
         f"int {p}_compute(const {p}_input *input, {p}_memory *memory, {p}_output *output)\n{{\n"
         f"    (void)input;\n    (void)memory;\n" + "\n".join(body) + "\n    return 0;\n}",
         f"int {p}_act(const {p}_input *input, {p}_memory *memory, {p}_output *output)\n{{\n"
@@ -140,6 +161,7 @@ def _text(name: str, plan: Plan, code: CodeOptions) -> str:
         f"    for (int i = 0; i < agents; i++) without += {p}_act(&input[i], &memory[i], &output[i]);\n"
         f"    return without;\n}}",
         *([choose] if choose else []),
+        *([unusual_text(plan, words)] if plan.guarded else []),
         _selftest(plan, words),
         "#endif",
     ]

@@ -6,13 +6,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from converters.formats.programs.weights import Kept
 from converters.graph.language import Language, bare, lines_of, numbers
 from converters.graph.ops.loops.base import Applied
 from converters.graph.program import Place
 from converters.graph.types import BOOL, FLOAT32, INT32, INT64
 
 #: What C# calls a dtype.
-CS_TYPES = {"float32": "float", "int32": "int", "int64": "long", "bool": "bool"}
+CS_TYPES = {"float32": "float", "int32": "int", "int64": "long", "bool": "bool", "int8": "sbyte", "float16": "ushort"}
 _SAME = {"exp": "Exp", "log": "Log", "sqrt": "Sqrt", "sin": "Sin", "cos": "Cos", "tan": "Tan", "tanh": "Tanh",
          "floor": "Floor", "ceil": "Ceiling", "rint": "Round"}  # fmt: skip
 #: Functions that a class brings along: of floats, and of whole numbers. .NET Standard 2.0 has Math in double alone.
@@ -43,6 +44,29 @@ _RAW = {
     "bits": ("Bits", "static int Bits(float a) { return new Word { number = a }.bits; }"),
     "of_bits": ("OfBits", "static float OfBits(int a) { return new Word { bits = a }.number; }"),
 }
+_TAKE = """static T[] Take<T>(byte[] bytes, int offset, int count, int size)
+{
+    var array = new T[count];
+    global::System.Buffer.BlockCopy(bytes, offset, array, 0, count * size);
+    return array;
+}"""
+_WIDEN = """static float[] Widen(sbyte[] steps, float[] length, int inner) // a length for each channel
+{
+    var wide = new float[steps.Length];
+    for (int i = 0; i < wide.Length; i++) wide[i] = steps[i] * length[i / inner % length.Length];
+    return wide;
+}"""
+_HALF = """static float[] Half(ushort[] bits) // numbers in 16 bits
+{
+    var wide = new float[bits.Length];
+    for (int i = 0; i < wide.Length; i++) {
+        int exponent = bits[i] >> 10 & 31;
+        long size = (bits[i] & 1023) + (exponent == 0 ? 0 : 1024);
+        float x = (float)(size << (exponent == 0 ? 1 : exponent)) * 2.98023224e-08f;
+        wide[i] = (bits[i] & 0x8000) != 0 ? -x : x;
+    }
+    return wide;
+}"""
 _WORD = """// The bits of a number.
 [global::System.Runtime.InteropServices.StructLayout(global::System.Runtime.InteropServices.LayoutKind.Explicit)]
 struct Word
@@ -128,11 +152,34 @@ class CSharp(Language):
         """The next number of an agent's stream."""
         return "Uniform()"
 
-    def constant(self, place: Place, name: str) -> str:
-        """The definition of a constant."""
+    def constant(self, kept: Kept) -> str:
+        """The array of a constant, widened where it is kept in fewer bytes; from ``bytes`` where it is in a file."""
+        parts = [kept.narrow, *([] if kept.step is None else [kept.step])]
+        kinds = [CS_TYPES[p.dtype.name] for p in parts]
+        if kept.offsets:
+            self.helpers["Take"] = _TAKE
+            arrays = [
+                f"Take<{kind}>(bytes, {offset}, {p.size}, {p.dtype.itemsize})"
+                for kind, p, offset in zip(kinds, parts, kept.offsets, strict=True)
+            ]
+        else:
+            pairs = zip(kinds, parts, strict=True)
+            arrays = [f"new {kind}[] {{\n    {lines_of(self._words(p))},\n}}" for kind, p in pairs]
+        if kept.step is not None:
+            self.helpers["Widen"] = _WIDEN
+            return f"Widen({', '.join(arrays)}, {kept.inner})"
+        if kept.narrow is not kept.place:
+            self.helpers["Half"] = _HALF
+            return f"Half({arrays[0]})"
+        return arrays[0]
+
+    def _words(self, place: Place) -> list[str]:
         assert place.value is not None
         value = place.value.reshape(-1)
-        plain = place.dtype == FLOAT32 and np.isfinite(value).all()
-        words = numbers(value) if plain else [self.literal(x, place.dtype) for x in value.tolist()]
-        kind = CS_TYPES[place.dtype.name]
-        return f"static readonly {kind}[] {name} = {{\n    {lines_of(words)},\n}};"
+        if place.dtype == np.float16:
+            return [str(x) for x in value.view(np.uint16).tolist()]
+        if place.dtype == np.int8:
+            return [str(x) for x in value.tolist()]
+        if place.dtype == FLOAT32 and np.isfinite(value).all():
+            return numbers(value)
+        return [self.literal(x, place.dtype) for x in value.tolist()]

@@ -11,10 +11,10 @@ from converters.formats.csharp.text import CS_TYPES, CSharp
 from converters.formats.format import WriteOptions
 from converters.formats.programs.members import Field
 from converters.formats.programs.plan import CLOSE, ROWS, Plan, formula, plan_of
+from converters.formats.programs.weights import weights_name
 from converters.graph.ops.loops.layers import box_muller, gumbel
 from converters.graph.printer import Printer
 from converters.policy.policy import Policy
-from signatures.code import CodeOptions
 
 _UNIFORM = """
     /// <summary>The stream of draws, splitmix64: above 0, below 1. The same seed, the same draws as in C.</summary>
@@ -42,15 +42,38 @@ _NORMAL = """
 """.strip("\n")
 
 
+_LOAD = """
+/// <summary>Takes the weights of all agents: the content of $FILE.</summary>
+/// <exception cref="System.IO.InvalidDataException">It is another file's, or damaged.</exception>
+public static void Load(global::System.IO.Stream stream)
+{
+    var bytes = new byte[$SIZE];
+    int size = 0;
+    for (int read; size < bytes.Length && (read = stream.Read(bytes, size, bytes.Length - size)) > 0; ) size += read;
+    if (size < bytes.Length || stream.ReadByte() >= 0)
+        throw new global::System.IO.InvalidDataException("the weights are not $SIZE bytes");
+    uint crc = 0xFFFFFFFFu;
+    foreach (byte one in bytes) {
+        crc ^= one;
+        for (int bit = 0; bit < 8; bit++) crc = (crc >> 1) ^ ((crc & 1) != 0 ? 0xEDB88320u : 0u);
+    }
+    if (~crc != $SUM) throw new global::System.IO.InvalidDataException("the weights have another checksum");
+$LINES    loaded = true;
+}
+"""
+
+
 def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
     """The class. Raises UnsupportedOpError."""
-    return {f"{policy.name}.cs": Pieces(_text(plan_of(policy, options), options.code).encode("ascii"))}
+    plan = plan_of(policy, options)
+    file = {} if plan.weights.file is None else {weights_name(policy.name): Pieces(plan.weights.file)}
+    return {f"{policy.name}.cs": Pieces(_text(policy.name, plan).encode("ascii")), **file}
 
 
-def _text(plan: Plan, code: CodeOptions) -> str:
+def _text(file: str, plan: Plan) -> str:
     header, program = plan.header, plan.program
     name, state = header.class_name, header.state
-    words = CSharp(code.math == "own")
+    words = CSharp(plan.code.math == "own")
     printer = Printer(words, "w_", (name, *sorted({f.name for f in (*header.fed, *header.answered)})))
     by_name = {f.spec.name: f for f in header.fed}
     for key, tensor in program.inputs.items():
@@ -62,6 +85,9 @@ def _text(plan: Plan, code: CodeOptions) -> str:
     fields = [(printer.name(p), CS_TYPES[p.dtype.name]) for p in printer.inputs(program)]
     body = [f"        {kind}[] {n} = this.{n};" for n, kind in (*fields, *(p[:2] for p in places))]
     body += statements
+    if plan.weights.file is not None:
+        wrong = 'throw new global::System.InvalidOperationException("load the weights first");'
+        body.insert(0, f"        if (!loaded) {wrong}")
     for f in header.answered:
         target = state if f is header.next_state and state else f
         source = printer.name(program.outputs[f.spec.name].place)
@@ -73,6 +99,7 @@ def _text(plan: Plan, code: CodeOptions) -> str:
     )
     stream = "        stream = seed;\n" if draws else ""
     members = [
+        _sizes(plan),
         "    // What the agent observes.\n" + "".join(map(_member, header.inputs)),
         "    // What it keeps: the stream of its draws, noise, its state.\n"
         + ("    ulong stream;\n" if draws else "")
@@ -93,11 +120,12 @@ def _text(plan: Plan, code: CodeOptions) -> str:
         '    /// <exception cref="System.IndexOutOfRangeException">An observed index lies outside.</exception>\n'
         "    public void Compute()\n    {\n" + "\n".join(body) + "\n    }",
         *([_choose(plan.chosen, plan.sizes, printer)] if plan.chosen else []),
+        *([_unusual(plan, words)] if plan.guarded else []),
         _selftest(plan, words),
         *([_UNIFORM] if draws else []),
         *([_NORMAL.replace("$X", printer.function(box_muller, "radius", "turn"))] if header.noise else []),
     ]
-    weights = [words.constant(place, printer.name(place)) for place in program.constants]
+    weights = _weights(file, plan, words, printer)
     inner = [*(m.rstrip("\n") for m in members), *methods]
     if words.helpers:
         inner += ["\n".join(f"    {line}" for line in h.splitlines()) for h in words.helpers.values()]
@@ -107,6 +135,49 @@ def _text(plan: Plan, code: CodeOptions) -> str:
         f"   Made by export-model.\n\n{plan.contract}\n\nnamespace Policies\n{{\n\n"
         f"/// <summary>One agent: what it observes, keeps and does are its members.</summary>\n"
         f"public sealed class {name}\n{{\n" + "\n\n".join(inner) + "\n}\n\n}\n"
+    )
+
+
+def _sizes(plan: Plan) -> str:
+    """The contract's numbers as constants."""
+    rows = [f"public const int {f.name} = {f.size};" for f in (*plan.header.fed, *plan.header.outputs)]
+    branches = f"new int[] {{ {', '.join(map(str, plan.sizes))} }}" if plan.sizes else "new int[0]"
+    return (
+        "    /// <summary>How many numbers each member has.</summary>\n    public static class Sizes\n    {\n"
+        + "".join(f"        {row}\n" for row in rows)
+        + "    }\n\n    /// <summary>How many actions each branch has.</summary>\n"
+        + f"    public static readonly int[] Branches = {branches};\n"
+    )
+
+
+def _weights(file: str, plan: Plan, words: CSharp, printer: Printer) -> list[str]:
+    """The constants, and the method that loads those that are in the file."""
+    named = [(printer.name(kept.place), CS_TYPES[kept.place.dtype.name], kept) for kept in plan.weights.kept]
+    parts = [f"static readonly {kind}[] {n} = {words.constant(kept)};" for n, kind, kept in named if not kept.offsets]
+    if plan.weights.file is None:
+        return parts
+    inside = [(n, kind, kept) for n, kind, kept in named if kept.offsets]
+    lines = "".join(f"    {n} = {words.constant(kept)};\n" for n, _, kept in inside)
+    load = _LOAD.replace("$FILE", weights_name(file)).replace("$SIZE", str(len(plan.weights.file)))
+    load = load.replace("$SUM", f"0x{plan.weights.checksum:08X}u").replace("$LINES", lines).strip("\n")
+    return [*parts, "\n".join(["static bool loaded;", *(f"static {kind}[] {n};" for n, kind, _ in inside)]), load]
+
+
+def _unusual(plan: Plan, words: CSharp) -> str:
+    """The method that counts what training did not see."""
+    kind, arrays, loops = np.dtype(np.float32), list[str](), list[str]()
+    for guarded in plan.guarded:
+        name = guarded.field.name
+        for called, values in (("mean", guarded.mean), ("limit", guarded.limit)):
+            literals = ", ".join(words.literal(x, kind) for x in values)
+            arrays.append(f"    static readonly float[] {called}_{name} = {{ {literals} }};\n")
+        off = f"global::System.Math.Abs({name}[i] - mean_{name}[i])"
+        loops.append(f"        for (int i = 0; i < {guarded.field.size}; i++)\n")
+        loops.append(f"            if (!({off} <= limit_{name}[i])) count++;\n")
+    return (
+        f"{''.join(arrays)}\n    /// <summary>How many observed numbers lie farther than {plan.code.guard:g} standard "
+        "deviations from their mean in training; NaN does.</summary>\n"
+        f"    public int Unusual()\n    {{\n        int count = 0;\n{''.join(loops)}        return count;\n    }}"
     )
 
 

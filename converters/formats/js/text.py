@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from converters.formats.programs.weights import Kept
 from converters.graph.language import Language, bare, lines_of, numbers
 from converters.graph.ops.loops.base import Applied, Element
 from converters.graph.ops.loops.own_math import OWN
@@ -13,7 +14,14 @@ from converters.graph.program import Place, every
 from converters.graph.types import BOOL, FLOAT32, INT32, INT64
 
 #: The arrays of each dtype. int64 is held in doubles, which have every whole number up to 2 to the 53.
-JS_ARRAYS = {"float32": "Float32Array", "int32": "Int32Array", "int64": "Float64Array", "bool": "Uint8Array"}
+JS_ARRAYS = {
+    "float32": "Float32Array",
+    "int32": "Int32Array",
+    "int64": "Float64Array",
+    "bool": "Uint8Array",
+    "int8": "Int8Array",
+}
+JS_ARRAYS["float16"] = "Uint16Array"
 _SAME = ("exp", "expm1", "log", "log1p", "sqrt", "sin", "cos", "tan", "tanh", "floor", "ceil")
 _PLAIN = {"max": "Math.max", "min": "Math.min", "abs": "Math.abs"}
 #: Functions of a number's bits.
@@ -30,6 +38,15 @@ _HELPERS = {
     "within": (
         "function within(a, count) {\n    if (a >= 0 && a < count) return a;\n"
         "    throw new RangeError(`the index ${a} lies outside of a table of ${count}`);\n}"
+    ),
+    "half": (
+        "function half(a) { // the number in 16 bits\n    const exponent = a >> 10 & 31;\n"
+        "    const size = ((a & 1023) + (exponent ? 1024 : 0)) * 2 ** ((exponent || 1) - 25);\n"
+        "    return a & 0x8000 ? -size : size;\n}"
+    ),
+    "widen": (
+        "function widen(steps, length, inner) { // a length for each channel\n"
+        "    return Float32Array.from(steps, (n, i) => n * length[Math.floor(i / inner) % length.length]);\n}"
     ),
     "whole": (
         "function whole(a, limit) {\n    return a >= -limit && a < limit ? Math.trunc(a) : -limit;\n}"
@@ -126,10 +143,27 @@ class JavaScript(Language):
                 return f"({operands[0]} {'+' if x.function == 'add' else '-'} {operands[1]} | 0)"
         return super().applied(x, operands)
 
-    def constant(self, place: Place, name: str) -> str:
-        """The definition of a constant."""
+    def constant(self, kept: Kept) -> str:
+        """The array of a constant, widened where it is kept in fewer bytes; from ``bytes`` where it is in a file."""
+        parts = [kept.narrow, *([] if kept.step is None else [kept.step])]
+        if kept.offsets:
+            pairs = zip(parts, kept.offsets, strict=True)
+            arrays = [f"new {JS_ARRAYS[p.dtype.name]}(bytes.buffer, {offset}, {p.size})" for p, offset in pairs]
+        else:
+            arrays = [f"new {JS_ARRAYS[p.dtype.name]}([\n    {lines_of(self._words(p))},\n])" for p in parts]
+        if kept.step is not None:
+            self.helpers["widen"] = _HELPERS["widen"]
+            return f"widen({', '.join(arrays)}, {kept.inner})"
+        if kept.narrow is not kept.place:
+            self.helpers["half"] = _HELPERS["half"]
+            return f"Float32Array.from({arrays[0]}, half)"
+        return arrays[0]
+
+    def _words(self, place: Place) -> list[str]:
         assert place.value is not None
         value = place.value.reshape(-1)
-        plain = place.dtype == FLOAT32 and np.isfinite(value).all()
-        words = numbers(value, "{}") if plain else [self.literal(x, place.dtype) for x in value.tolist()]
-        return f"const {name} = new {JS_ARRAYS[place.dtype.name]}([\n    {lines_of(words)},\n]);"
+        if place.dtype == np.float16:
+            return [str(x) for x in value.view(np.uint16).tolist()]
+        if place.dtype == FLOAT32 and np.isfinite(value).all():
+            return numbers(value, "{}")
+        return [self.literal(x, place.dtype) for x in value.tolist()]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -12,10 +13,10 @@ from converters.formats.format import WriteOptions
 from converters.formats.js.text import JS_ARRAYS, JavaScript
 from converters.formats.programs.members import Field
 from converters.formats.programs.plan import CLOSE, ROWS, Plan, formula, plan_of
+from converters.formats.programs.weights import weights_name
 from converters.graph.ops.loops.layers import box_muller, gumbel
 from converters.graph.printer import Printer
 from converters.policy.policy import Policy
-from signatures.code import CodeOptions
 
 _UNIFORM = """
     /** The stream of draws, splitmix64: above 0, below 1. The same seed gives the same draws as in C and C#. */
@@ -39,16 +40,33 @@ _NORMAL = """
 """.strip("\n")
 
 
+_LOAD = """
+/** Takes the weights: the content of $FILE, an ArrayBuffer or a Uint8Array. Throws where it is another file's. */
+export function load(content) {
+    const bytes = content instanceof ArrayBuffer ? new Uint8Array(content) : Uint8Array.from(content);
+    let crc = -1;
+    for (const byte of bytes) {
+        crc ^= byte;
+        for (let bit = 0; bit < 8; bit++) crc = crc >>> 1 ^ (crc & 1 ? 0xEDB88320 : 0);
+    }
+    if (bytes.length !== $SIZE) throw new RangeError(`the weights are ${bytes.length} bytes, not $SIZE`);
+    if (~crc >>> 0 !== $SUM) throw new RangeError("the weights have another checksum");
+$LINES    loaded = true;
+}
+"""
+
+
 def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
     """The module. Raises UnsupportedOpError."""
-    text = _text(policy.name, plan_of(policy, options), options.code)
-    return {f"{policy.name}.mjs": Pieces(text.encode("ascii"))}
+    plan = plan_of(policy, options)
+    file = {} if plan.weights.file is None else {weights_name(policy.name): Pieces(plan.weights.file)}
+    return {f"{policy.name}.mjs": Pieces(_text(policy.name, plan).encode("ascii")), **file}
 
 
-def _text(name: str, plan: Plan, code: CodeOptions) -> str:
+def _text(name: str, plan: Plan) -> str:
     header, program = plan.header, plan.program
     taken = ("fround", header.class_name, *sorted({f.name for f in (*header.fed, *header.answered)}))
-    words = JavaScript(code.math == "own")
+    words = JavaScript(plan.code.math == "own")
     printer = Printer(words, "w_", taken)
     by_name = {f.spec.name: f.name for f in header.fed}
     for key, tensor in program.inputs.items():
@@ -57,6 +75,9 @@ def _text(name: str, plan: Plan, code: CodeOptions) -> str:
     places = [stage.result.place for stage in program.stages]
     aliases = sorted({*(printer.name(p) for p in printer.inputs(program)), *map(printer.name, places)})
     body = [f"        const {{ {', '.join(aliases)} }} = this;"] if aliases else []
+    if plan.weights.file is not None:
+        body.insert(0, '        if (!loaded) throw new Error("load the weights first");')
+    weights = _weights(name, plan, words, printer)
     body += statements
     for f in header.answered:
         target = header.state if f is header.next_state and header.state else f
@@ -81,22 +102,24 @@ def _text(name: str, plan: Plan, code: CodeOptions) -> str:
         + "\n".join(body)
         + "\n    }",
         *([_choose(plan.chosen, plan.sizes, printer)] if plan.chosen else []),
+        *([_unusual(plan, words)] if plan.guarded else []),
         _selftest(plan, words),
         *([_UNIFORM] if draws else []),
         *([_NORMAL.replace("$X", printer.function(box_muller, "radius", "turn"))] if header.noise else []),
     ]
-    ports = {
+    ports: dict[str, Any] = {
         kind: {f.spec.name: [f.name, f.spec.dtype, list(f.spec.shape)] for f in some}
         for kind, some in (("inputs", header.fed), ("outputs", header.outputs))
     }
+    ports["branches"] = list(plan.sizes)
     state = [header.state.name, header.next_state.spec.name] if header.state and header.next_state else None
     parts = [
         f"/* {header.class_name}: a policy without a runtime, for browsers, Node and others that have ES modules:\n"
         f'       import {{ {header.class_name} }} from "./{name}.mjs";\n'
         f"   Made by export-model.\n\n{plan.contract}",
         "const { fround } = Math;",
-        *(words.constant(place, printer.name(place)) for place in program.constants),
         *words.helpers.values(),
+        *weights,
         f"/** One agent: what it observes, keeps and does are its members, arrays that live as long as it. */\n"
         f"export class {header.class_name} {{\n" + "\n\n".join(methods) + "\n}",
         "/** Names of the contract: [member, dtype, shape]; the state's member, and the name of its next value. */\n"
@@ -104,6 +127,37 @@ def _text(name: str, plan: Plan, code: CodeOptions) -> str:
         f"export default {header.class_name};",
     ]
     return "\n\n".join(parts) + "\n"
+
+
+def _weights(name: str, plan: Plan, words: JavaScript, printer: Printer) -> list[str]:
+    """The constants, and the function that loads those that are in the file."""
+    named = [(printer.name(kept.place), kept) for kept in plan.weights.kept]
+    parts = [f"const {n} = {words.constant(kept)};" for n, kept in named if not kept.offsets]
+    if plan.weights.file is None:
+        return parts
+    inside = [(n, kept) for n, kept in named if kept.offsets]
+    lines = "".join(f"    {n} = {words.constant(kept)};\n" for n, kept in inside)
+    load = _LOAD.replace("$FILE", weights_name(name)).replace("$SIZE", str(len(plan.weights.file)))
+    load = load.replace("$SUM", f"0x{plan.weights.checksum:08X}").replace("$LINES", lines).strip("\n")
+    return [*parts, "\n".join(["let loaded = false;", *(f"let {n};" for n, _ in inside)]), load]
+
+
+def _unusual(plan: Plan, words: JavaScript) -> str:
+    """The method that counts what training did not see."""
+    kind, lines = np.dtype(np.float32), list[str]()
+    for guarded in plan.guarded:
+        mean, limit = (", ".join(words.literal(x, kind) for x in v) for v in (guarded.mean, guarded.limit))
+        one = f"this.{guarded.field.name}"
+        lines.append(f"        {{\n            const mean = [{mean}], limit = [{limit}];\n")
+        lines.append(
+            f"            {one}.forEach((x, i) => {{ if (!(Math.abs(x - mean[i]) <= limit[i])) count++; }});\n"
+        )
+        lines.append("        }\n")
+    return (
+        f"    /** How many observed numbers lie farther than {plan.code.guard:g} standard deviations from their mean\n"
+        "     *  in training; NaN does. */\n    unusual() {\n        let count = 0;\n"
+        f"{''.join(lines)}        return count;\n    }}"
+    )
 
 
 def _member(field: Field) -> str:

@@ -11,7 +11,8 @@ from converters.files.children.confinement import in_force
 from converters.files.fetch import read_bytes
 from converters.formats.format import Port, Ports
 from converters.formats.programs.members import answers
-from signatures.contract import EMBEDDED, parse
+from signatures.code import CodeOptions
+from signatures.contract import EMBEDDED, Contract, parse
 from signatures.errors import DamagedFileError, UnsupportedOpError
 
 #: What a file's ending says of its format.
@@ -25,15 +26,20 @@ def held(path: Path) -> str | None:
     return rest.partition(b"\n*/")[0].decode("ascii", "replace") if found else None
 
 
-def ports(path: Path) -> Ports:
-    """What it takes and gives, as its contract says. Raises SourceError, DamagedFileError."""
+def contract_held(path: Path) -> Contract:
+    """The contract of a file of ours. Raises SourceError, DamagedFileError, FieldError."""
     text = held(path)
     if text is None:
         raise DamagedFileError(
             f"{path.name} has no contract", why="export-model did not write it", fix="export it again"
         )
-    signature = parse(json.loads(text)).signature
-    wanted = answers(signature)
+    return parse(json.loads(text))
+
+
+def ports(path: Path) -> Ports:
+    """What it takes and gives, as its contract says. Raises SourceError, DamagedFileError."""
+    contract = contract_held(path)
+    signature, wanted = contract.signature, answers(contract.signature, CodeOptions.of(contract.tool))
     return Ports(
         path,
         tuple(Port(s.name, s.dtype, s.shape) for s in signature.inputs),

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 
 from converters.graph.language import identifier
 from converters.graph.nodes import NameScope
+from signatures.code import CodeOptions
 from signatures.records import dataclass
 from signatures.roles import Role
 from signatures.spec import PolicySignature, TensorSpec
@@ -61,18 +62,19 @@ class Header:
         return (*self.outputs, *((self.next_state,) if self.next_state else ()))
 
 
-def answers(signature: PolicySignature) -> list[str]:
-    """The outputs that a header answers: the actor's."""
+def answers(signature: PolicySignature, code: CodeOptions | None = None) -> list[str]:
+    """The outputs that a header answers: the actor's, or all."""
     heads = {head.name for head in signature.heads}
-    return [s.name for s in signature.outputs if s.name in heads or s.role not in _REST]
+    everything = code is not None and code.outputs == "all"
+    return [s.name for s in signature.outputs if everything or s.name in heads or s.role not in _REST]
 
 
-def header_of(name: str, signature: PolicySignature) -> Header:
+def header_of(name: str, signature: PolicySignature, code: CodeOptions | None = None) -> Header:
     """What the header of the policy ``name`` calls what."""
     word = identifier(name)
     prefix = word if not word[0].isdigit() else f"policy_{word}"
     memory_in, memory_out = signature.recurrence or ("", "")
-    wanted = answers(signature)
+    wanted = answers(signature, code)
     fields = _fields(s for s in signature.inputs)
     outputs = [f for f in _fields(s for s in signature.outputs) if f.spec.name in wanted]
     return Header(

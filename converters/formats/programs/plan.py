@@ -9,18 +9,29 @@ import numpy as np
 from converters.compiler.targets import PROGRAM, prepare
 from converters.formats.format import WriteOptions
 from converters.formats.programs.members import Field, Header, header_of
+from converters.formats.programs.weights import Weights, weights_of
 from converters.graph.ops.table import traits
 from converters.graph.program import Program, program_of
 from converters.graph.run import run_graph
 from converters.policy.policy import Policy
+from signatures.code import CodeOptions
 from signatures.contract import EMBEDDED
-from signatures.errors import GraphError
+from signatures.errors import GraphError, UsageError
 from signatures.records import dataclass
 from signatures.roles import Role
 
 #: Golden rows of the self test, and how far float32 may be off.
 ROWS = 3
 CLOSE = "1e-4"
+
+
+@dataclass(frozen=True, slots=True)
+class Guarded:
+    """An observation's mean in training, number by number, and how far from it is usual."""
+
+    field: Field
+    mean: tuple[float, ...]
+    limit: tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,11 +49,15 @@ class Plan:
     sizes: tuple[int, ...]
     checked: tuple[Field, ...]
     golden: tuple[float, ...]
+    weights: Weights
+    code: CodeOptions
+    guarded: tuple[Guarded, ...] = ()
 
 
 def plan_of(policy: Policy, options: WriteOptions) -> Plan:
-    """Plan a policy's program. Raises UnsupportedOpError."""
-    header = header_of(policy.name, policy.signature)
+    """Plan a policy's program. Raises UnsupportedOpError, UsageError."""
+    code = options.code
+    header = header_of(policy.name, policy.signature, code)
     fetches = {f.spec.name: policy.fetches[f.spec.name] for f in header.answered}
     program = program_of(prepare(policy, PROGRAM), policy.feeds, fetches)
     contract = "".join(c if c.isascii() else json.dumps(c)[1:-1] for c in options.contract)
@@ -51,7 +66,28 @@ def plan_of(policy: Policy, options: WriteOptions) -> Plan:
     chosen = next((f for f in header.outputs if f.spec.role is Role.LOG_PROBS), None)
     chosen = chosen if chosen is not None and sum(sizes) == chosen.size else None
     checked, golden = _golden(policy, header)
-    return Plan(header, program, f"   {EMBEDDED}: {contract}\n*/", chosen, sizes, checked, golden)
+    weights = weights_of(program, options.weights, in_file=code.weights == "file")
+    guarded = () if code.guard is None else _guarded(policy.name, header, code.guard)
+    text = f"   {EMBEDDED}: {contract}\n*/"
+    return Plan(header, program, text, chosen, sizes, checked, golden, weights, code, guarded)
+
+
+def _guarded(name: str, header: Header, most: float) -> tuple[Guarded, ...]:
+    """The observations that the policy normalises, and how far they may lie. Raises UsageError."""
+    found = []
+    for f in header.inputs:
+        said = f.spec.distribution or {}
+        if said.get("kind") == "normal" and f.spec.dtype == "float32":
+            mean, std = (np.resize(np.asarray(said[key], np.float32), f.size).tolist() for key in ("mean", "std"))
+            limit = [float(np.float32(most * s)) for s in std]
+            found.append(Guarded(f, tuple(mean), tuple(limit)))
+    if not found:
+        raise UsageError(
+            f"--guard {most:g}: {name} has no normaliser",
+            why="its running mean and deviation say what training saw",
+            fix="leave --guard out",
+        )
+    return tuple(found)
 
 
 def formula(field: Field, floats: str) -> str:

@@ -23,11 +23,12 @@ from converters.files.children import confinement
 from converters.files.children.bounded import run_bounded
 from converters.files.children.child import Model, claim_stdout, serve
 from converters.files.children.frames import Tensors
-from converters.formats.programs.artifact import held
+from converters.formats.programs.artifact import contract_held
 from converters.formats.programs.members import Header, header_of
+from converters.formats.programs.weights import weights_name
 from converters.runtimes.c import compiler
 from converters.runtimes.rows import as_declared, fed_rows, row_count
-from signatures.contract import parse
+from signatures.code import CodeOptions
 from signatures.errors import ExportModelError
 
 FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-O2", "-ffp-contract=off", "-fPIC", "-shared")
@@ -44,7 +45,7 @@ class CompileError(Exception):
     """The compiler's own words."""
 
 
-def driver(header: Header) -> str:
+def driver(header: Header, code: CodeOptions) -> str:
     """A source file that calls a header's functions row by row, for whatever is fed under the policy's names."""
     p = header.prefix
     state = [header.state] if header.state else []
@@ -53,12 +54,14 @@ def driver(header: Header) -> str:
     given += [f"memory.{header.state.name}"] if header.state and header.next_state else []
     copies = [f"memcpy(&{n}, (const char *)in[{i}] + row * sizeof {n}, sizeof {n});" for i, n in enumerate(fed)]
     answers = [f"memcpy((char *)out[{i}] + row * sizeof {n}, &{n}, sizeof {n});" for i, n in enumerate(given)]
+    loads, load = code.weights == "file", "int judge_load(const void *weights, size_t size)"
     lines = "\n        ".join([*copies, f"without += {p}_compute(&input, &memory, &output);", *answers])
     return (
         f'#define {p.upper()}_IMPLEMENTATION\n#define {p.upper()}_SELFTEST\n#include "policy.h"\n#include <stddef.h>\n'
         f"static {p}_memory memory;\nvoid judge_reset(uint64_t seed);\nint judge_selftest(void);\n"
         f"int judge(size_t rows, const void *const *in, void *const *out);\n"
-        f"void judge_reset(uint64_t seed) {{ {p}_reset(&memory, seed); }}\n"
+        + (f"{load};\n{load} {{ return {p}_load(&memory, weights, size); }}\n" if loads else "")
+        + f"void judge_reset(uint64_t seed) {{ {p}_reset(&memory, seed); }}\n"
         f"int judge_selftest(void) {{ return {p}_selftest(&memory); }}\n"
         f"int judge(size_t rows, const void *const *in, void *const *out)\n{{\n    static {p}_input input;\n"
         f"    static {p}_output output;\n    int without = 0;\n    (void)in;\n    (void)out;\n"
@@ -68,11 +71,18 @@ def driver(header: Header) -> str:
 
 class _Library:
     def __init__(self, path: Path, seed: int, build: _Builder) -> None:
-        text = held(path)
-        if text is None:
-            raise ValueError(f"{path.name} has no contract")
-        self.header = header_of(path.stem, parse(json.loads(text)).signature)
-        self.library = ctypes.CDLL(str(build(driver(self.header), path)))
+        contract = contract_held(path)
+        code = CodeOptions.of(contract.tool)
+        self.header = header_of(path.stem, contract.signature, code)
+        self.library = ctypes.CDLL(str(build(driver(self.header, code), path)))
+        if code.weights == "file":
+            file = path.with_name(weights_name(path.stem)).read_bytes()
+            self.weights = np.frombuffer(
+                file, np.uint8
+            ).copy()  # numpy aligns what it makes; the library reads it there
+            pointer = ctypes.c_void_p(self.weights.ctypes.data)
+            if refused := self.library.judge_load(pointer, ctypes.c_size_t(self.weights.size)):
+                raise ValueError(f"its weights are refused with {refused}")
         if wrong := self.library.judge_selftest():
             raise ValueError(f"its self test finds {wrong} wrong numbers")
         self.library.judge_reset(ctypes.c_uint64(seed))

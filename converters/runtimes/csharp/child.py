@@ -6,7 +6,6 @@ a network. Memory, time and system calls of each are bounded.
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import subprocess
@@ -22,11 +21,12 @@ from converters.files.children import confinement
 from converters.files.children.bounded import bounds, run_bounded
 from converters.files.children.child import Model, claim_stdout, serve
 from converters.files.children.frames import Tensors
-from converters.formats.programs.artifact import held
+from converters.formats.programs.artifact import contract_held
 from converters.formats.programs.members import Field, Header, header_of
+from converters.formats.programs.weights import weights_name
 from converters.runtimes.csharp import tools
 from converters.runtimes.rows import as_declared, fed_rows, row_count
-from signatures.contract import parse
+from signatures.code import CodeOptions
 from signatures.errors import ExportModelError
 
 FLAGS = ("-langversion:7", "-warn:4", "-warnaserror", "-optimize+", "-nologo")
@@ -42,7 +42,7 @@ class CompileError(Exception):
     """The compiler's own words."""
 
 
-def driver(header: Header) -> str:
+def driver(header: Header, code: CodeOptions) -> str:
     """Return a program that feeds a class row by row: what it reads and writes lies one after the other, in bytes."""
 
     def copies(fields: Sequence[Field], into: bool) -> str:
@@ -55,12 +55,14 @@ def driver(header: Header) -> str:
             at += size
         return " ".join(lines)
 
+    file = "using (var file = System.IO.File.OpenRead(words[1]))"
+    load = f"{file} Policies.{header.class_name}.Load(file);\n        " if code.weights == "file" else ""
     return f"""
 static class Driver
 {{
     static int Main(string[] words)
     {{
-        var agent = new Policies.{header.class_name}(ulong.Parse(words[0]));
+        {load}var agent = new Policies.{header.class_name}(ulong.Parse(words[0]));
         int wrong = agent.SelfTest();
         agent.Reset(ulong.Parse(words[0]));
         var reader = new System.IO.BinaryReader(System.Console.OpenStandardInput());
@@ -95,13 +97,14 @@ def _bytes(fields: Sequence[Field]) -> int:
 
 class _Program:
     def __init__(self, path: Path, seed: int, folder: Path, compiler: str, mono: str) -> None:
-        text = held(path)
-        if text is None:
-            raise ValueError(f"{path.name} has no contract")
-        self.header = header_of(path.stem, parse(json.loads(text)).signature)
+        contract = contract_held(path)
+        code = CodeOptions.of(contract.tool)
+        self.header = header_of(path.stem, contract.signature, code)
         own = Path(tempfile.mkdtemp(dir=folder))
+        if code.weights == "file":
+            shutil.copyfile(path.with_name(weights_name(path.stem)), own / "weights.bin")
         shutil.copyfile(path, own / "policy.cs")
-        (own / "driver.cs").write_text(driver(self.header), "ascii")
+        (own / "driver.cs").write_text(driver(self.header, code), "ascii")
         size = path.stat().st_size
         done = run_bounded(
             [compiler, *FLAGS, "-out:policy.exe", "policy.cs", "driver.cs"],
@@ -112,7 +115,7 @@ class _Program:
         if done.returncode:
             raise CompileError((done.stdout + done.stderr)[:2000])
         self.process = subprocess.Popen(  # one thread, so nothing can hold a lock across the fork
-            [mono, str(own / "policy.exe"), str(seed)],
+            [mono, str(own / "policy.exe"), str(seed), str(own / "weights.bin")],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             preexec_fn=bounds(_BYTES + size * _BYTES_PER_BYTE, _RUN_SECONDS, starts=False),

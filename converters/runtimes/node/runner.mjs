@@ -2,6 +2,7 @@
  * ES modules that were written without a runtime, in Node: fed row by row, over frames on stdin and stdout.
  */
 
+import { readFile } from "node:fs/promises";
 import process from "node:process";
 import { pathToFileURL } from "node:url";
 
@@ -21,7 +22,8 @@ function elements({ dtype }, body) {
 const count = (shape) => shape.reduce((product, n) => product * (n ?? 1), 1);
 
 async function load({ path, seed }) {
-  const { default: Policy, ports } = await import(pathToFileURL(path).href);
+  const { default: Policy, ports, load: takeWeights } = await import(pathToFileURL(path).href);
+  takeWeights?.(await readFile(path.replace(/\.mjs$/, ".weights.bin")));
   const agent = new Policy(seed ?? Math.floor(Math.random() * 2 ** 48));
   const wrong = agent.selftest();
   if (wrong) throw new Error(`its self test finds ${wrong} wrong numbers`);
