@@ -348,7 +348,9 @@ def _memory(entry: Field, inputs: tuple[TensorSpec, ...], outputs: tuple[TensorS
     taken = None if entry["input"].missing else entry["input"].one_of([s.name for s in inputs])
     given = None if entry["output"].missing else entry["output"].one_of([s.name for s in outputs])
     layout = tuple(part.text() for part in entry["layout"].items())
-    return Memory(entry["size"].integer(0, 2**31 - 1), taken, given, layout)
+    others = [] if entry["others"].missing else [_pair(pair) for pair in entry["others"].items()]
+    pairs = tuple((a.one_of([s.name for s in inputs]), b.one_of([s.name for s in outputs])) for a, b in others)
+    return Memory(entry["size"].integer(0, 2**31 - 1), taken, given, layout, pairs)
 
 
 def _constant(value: Field) -> Constant:

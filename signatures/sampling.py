@@ -130,9 +130,10 @@ def draw_rollout(signature: PolicySignature, *, seed: int, steps: int, batch: in
     """Feeds for ``steps`` steps in a row; the memory in the first is zero, as at the start of an episode."""
     rng = np.random.default_rng((seed, 1))
     feeds = [_case(signature, rng, "", batch, _typical).feeds for _ in range(steps)]
-    if signature.memory is not None and signature.memory.input is not None:
-        name = signature.memory.input
-        feeds[0][name] = np.zeros_like(feeds[0][name])
+    if signature.memory is not None:
+        for name in (signature.memory.input, *(taken for taken, _ in signature.memory.others)):
+            if name is not None:
+                feeds[0][name] = np.zeros_like(feeds[0][name])
     return feeds
 
 

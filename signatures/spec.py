@@ -76,16 +76,19 @@ class TensorSpec:
 class Memory:
     """Recurrent state: ``size`` floats per agent, fed as ``input`` and read from ``output`` (None where the source
     has lost it). ``layout`` names its parts in order, for example ``("c", "h")``, or is empty where it is unknown.
+    ``others`` are further (input, output) pairs of a memory in several tensors, a part of ``layout`` each.
     """
 
     size: int
     input: str | None
     output: str | None
     layout: tuple[str, ...] = ()
+    others: tuple[tuple[str, str], ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """As in policy.json."""
-        return {"size": self.size, "input": self.input, "output": self.output, "layout": list(self.layout)}
+        entry = {"size": self.size, "input": self.input, "output": self.output, "layout": list(self.layout)}
+        return {**entry, "others": [list(pair) for pair in self.others]} if self.others else entry
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,12 +173,21 @@ class PolicySignature:
         return next((head.plain for head in self.heads if head.name == output), None)
 
     @property
-    def recurrence(self) -> tuple[str, str] | None:
-        """(the memory's input, the output that is fed back into it); None where there is no such pair."""
+    def recurrences(self) -> tuple[tuple[str, str], ...]:
+        """(an input of the memory, the output that is fed back into it): nearly always one pair, or none."""
         memory = self.memory
         if memory is None or memory.input is None or memory.output is None:
-            return None
-        return memory.input, memory.output
+            return ()
+        return ((memory.input, memory.output), *memory.others)
+
+    @property
+    def recurrence(self) -> tuple[str, str] | None:
+        """The first of ``recurrences``, the only one of a policy under its own names; None where there is none."""
+        return next(iter(self.recurrences), None)
+
+    def fed_back(self, outputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """What the inputs of the memory take in the step after ``outputs``."""
+        return {taken: outputs[given] for taken, given in self.recurrences}
 
     @property
     def log_probs(self) -> TensorSpec | None:

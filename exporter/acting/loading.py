@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from exporter.acting.one_memory import with_one_memory
 from exporter.acting.policy import LoadedPolicy
 from signatures.batches import Run, in_batches
 from signatures.contract import POLICY
@@ -94,6 +95,7 @@ def _of_bundle(folder: Path, runtime: str | None, seed: int) -> LoadedPolicy:
         run, declared = _RUNS[chosen](model)
     found.check_fits(files[chosen], declared)
     run = in_batches(run, found.contract.tool.get("batch") if chosen == "onnxruntime" else None, signature)
+    signature, run = with_one_memory(signature, run)
     return LoadedPolicy(found.name, signature, run, chosen, seed, draws_itself=kept)
 
 

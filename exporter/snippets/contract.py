@@ -68,10 +68,17 @@ class Bundle:
         return any(s.role in (Role.MEMORY_IN, Role.PREV_ACTION) for s in self.signature.inputs)
 
     @property
+    def memories(self) -> list[tuple[TensorSpec, str, str]]:
+        """(an input of the memory, the output that is fed back into it, the variable that a snippet keeps for it)."""
+        return [
+            (self.signature.input(taken), given, f"memory{number or ''}")
+            for number, (taken, given) in enumerate(self.signature.recurrences)
+        ]
+
+    @property
     def memory(self) -> tuple[TensorSpec, str] | None:
-        """(the input, the output that is fed back into it), None where there is no such pair."""
-        pair = self.signature.recurrence
-        return None if pair is None else (self.signature.input(pair[0]), pair[1])
+        """(the input, the output that is fed back into it) of a memory in one tensor, None where there is none."""
+        return self.memories[0][:2] if self.memories else None
 
     @property
     def previous(self) -> TensorSpec | None:
@@ -81,14 +88,15 @@ class Bundle:
     @property
     def kept_variables(self) -> dict[str, str]:
         """Input → the variable that a snippet keeps for it from step to step."""
-        kept = {} if self.memory is None else {self.memory[0].name: "memory"}
+        kept = {spec.name: variable for spec, _, variable in self.memories}
         return kept if self.previous is None else {**kept, self.previous.name: "previous"}
 
     def beginnings(self, line: str, value: Callable[[TensorSpec], str]) -> list[str]:
         """Lines that declare ``kept_variables``; ``line`` is given a variable, its first value and a comment."""
         says = {"memory": "the start of an episode; a row per agent", "previous": "no action yet"}
         return [
-            line.format(name, value(self.signature.input(key)), says[name]) for key, name in self.kept_variables.items()
+            line.format(name, value(self.signature.input(key)), says[name.rstrip("0123456789")])
+            for key, name in self.kept_variables.items()
         ]
 
     @property

@@ -96,10 +96,11 @@ def _array(spec: TensorSpec) -> str:
 
 def inference_engine(bundle: Bundle) -> str:
     """ModelLoader and Worker. The engine has float and int tensors; int64 becomes int."""
-    memory, previous, kept = bundle.memory, bundle.previous, bundle.kept_variables
-    fields = []
-    if memory is not None:
-        fields.append(f"    float[] memory = new float[{example_size(memory[0])}];  // the start of an episode")
+    previous, kept = bundle.previous, bundle.kept_variables
+    fields = [
+        f"    float[] {variable} = new float[{example_size(taken)}];  // the start of an episode"
+        for taken, _, variable in bundle.memories
+    ]
     if previous is not None:
         fields.append(f"    int[] previous = new int[{example_size(previous)}];  // no action yet")
     parameters, body = [], []
@@ -122,9 +123,9 @@ def inference_engine(bundle: Bundle) -> str:
         body += [f"// {line}" for line in action_meaning(bundle, head)]
         body.append(_read(spec, f"{name}Tensor"))
         body.append(f"var {name} = {name}Tensor.DownloadToArray();")
-    if memory is not None:
-        body.append(_read(bundle.signature.output(memory[1]), "memoryTensor"))
-        body.append("memory = memoryTensor.DownloadToArray();")
+    for _, given, variable in bundle.memories:
+        body.append(_read(bundle.signature.output(given), f"{variable}Tensor"))
+        body.append(f"{variable} = {variable}Tensor.DownloadToArray();")
     if previous is not None:
         body.append(f"previous = {bundle.discrete_variable};")
     kinds = [f"{'float' if s.dtype == 'float32' else 'int'}[]" for s in fetched.values()]

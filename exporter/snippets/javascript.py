@@ -114,9 +114,8 @@ def _plain(bundle: Bundle, value: Callable[[TensorSpec], str], run: str, read: s
     lines += ["};", run]
     lines += [read.format(name, string_literal(output.name)) for name, output in bundle.fetched_outputs.items()]
     before = bundle.beginnings("let {} = {};  // {}", value)
-    memory, previous = bundle.memory, bundle.previous
-    if memory is not None:
-        lines.append(f"memory = outputs[{string_literal(memory[1])}];")
+    previous = bundle.previous
+    lines += [f"{variable} = outputs[{string_literal(given)}];" for _, given, variable in bundle.memories]
     if previous is not None:
         lines.append(_again(previous, bundle.discrete_variable, tensorflow=value is _tf_value))
     lines += [f"// {_safe(line)}" for head in bundle.heads for line in action_meaning(bundle, head)]

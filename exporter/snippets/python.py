@@ -64,15 +64,14 @@ def play(bundle: Bundle, run: list[str]) -> str:
     """From feeds to actions by ``run``, which makes ``outputs`` (name → array) of ``feeds``."""
     before = ["rng = np.random.default_rng()"] if _draws(bundle) else []
     before += bundle.beginnings("{} = {}  # {}", array)
-    memory, previous = bundle.memory, bundle.previous
+    previous = bundle.previous
     lines = ["feeds = {"]
     for spec in bundle.signature.inputs:
         lines += _entry(bundle, spec, _feed_expression(bundle, spec))
     lines += ["}", *run]
     for variable, head in zip(bundle.variables, bundle.heads, strict=True):
         lines += _action(bundle, variable, head)
-    if memory is not None:
-        lines.append(f"memory = outputs[{string_literal(memory[1])}]")
+    lines += [f"{variable} = outputs[{string_literal(given)}]" for _, given, variable in bundle.memories]
     if previous is not None:
         shape = ".reshape(-1)" if len(previous.shape) == 1 else ""
         lines.append(f"previous = {bundle.discrete_variable}{shape}.astype({_dtype(previous)})")

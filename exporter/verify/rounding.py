@@ -61,12 +61,12 @@ class Rounding:
         return self._known[key][0] if self._known[key] else {}
 
     def steps(
-        self, model: LoadedModel, rolled: Rolled, memory: str, number: int, runtime: str, *, sure: bool
+        self, model: LoadedModel, rolled: Rolled, memory: Sequence[str], number: int, runtime: str, *, sure: bool
     ) -> Mapping[str, np.ndarray]:
         """Of step ``number`` with ``memory`` fed back: what every step before it made is carried along."""
         key = ("", _ARITHMETIC.get(runtime, "processor"), sure)
         if key not in self._known:
-            names = list(dict.fromkeys([*self._names, memory]))
+            names = list(dict.fromkeys([*self._names, *memory]))
             try:
                 exact = rolled(lambda feeds: model.run(feeds, names))
                 moved = [_jittered_answers(model, rolled, jitter, key[1], names) for jitter in self._runs(sure)]

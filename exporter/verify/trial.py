@@ -53,7 +53,7 @@ class Trial:
         self.golden = Golden() if options.golden is None else read_golden(Path(options.golden), self.signature)
         drawn = draw_cases(self.signature, seed=options.seed, samples=options.samples)
         self.cases = [*drawn, *self.golden.cases]
-        recurrent = self.signature.recurrence is not None
+        recurrent = bool(self.signature.recurrences)
         self.steps: list[Feeds] = []
         if recurrent:
             self.steps += draw_rollout(self.signature, seed=options.seed, steps=options.steps)
@@ -158,10 +158,9 @@ class Trial:
 
     def _fed_at(self, step: int) -> Feeds:
         """What the reference was fed at a step of the rollout."""
-        if not step or self.signature.recurrence is None:
+        if not step:
             return self.steps[step]
-        fed, kept = self.signature.recurrence
-        return {**self.steps[step], fed: self.expected_steps[step - 1][kept]}
+        return {**self.steps[step], **self.signature.fed_back(self.expected_steps[step - 1])}
 
     def differences(
         self,
@@ -188,8 +187,7 @@ class Trial:
         """Per output, what rounding explains of it."""
         if isinstance(at, Case):
             return self.rounding.outputs(self.reference.model, at, participant.runtime, sure=sure)
-        assert self.signature.recurrence is not None
-        kept, runtime = self.signature.recurrence[1], participant.runtime
+        kept, runtime = [given for _, given in self.signature.recurrences], participant.runtime
         return self.rounding.steps(self.reference.model, self.roll_out, kept, at, runtime, sure=sure)
 
     def _compare(
@@ -274,9 +272,8 @@ class Trial:
         """Outputs of each step, the memory fed back."""
         answers: list[Arrays] = []
         for feeds in self.steps:
-            if answers and self.signature.recurrence is not None:
-                fed, kept = self.signature.recurrence
-                feeds = {**feeds, fed: answers[-1][kept]}
+            if answers:
+                feeds = {**feeds, **self.signature.fed_back(answers[-1])}
             answers.append(run(feeds))
         return answers
 
