@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from converters.compiler.passes.weights import Storage, round_weights
+from converters.formats.bundle.embed import FIXED_BATCH
 from converters.formats.format import Artifact, Format, WriteOptions
 from converters.formats.registry import WRITTEN
 from converters.formats.source import ReadOptions, SourceModel
@@ -89,6 +90,10 @@ def artefacts_of(
             return contract, artifacts, tuple(notes)
         how = job.profile.write_options(contract.compact())
         artifacts = [_artifact(f, job.policy, how) for f in formats]
+        for artifact in artifacts if job.profile.loaders else ():
+            from converters.consumers.robots.loaders import loadable
+
+            loadable(job.profile.name, job.profile.loaders, artifact.files[artifact.main].to_bytes(), job.policy.name)
         if job.profile.importers:
             from converters.consumers.importable import importable
             from converters.consumers.playable import playable
@@ -174,7 +179,7 @@ def own_in(job: Job, formats: Sequence[Format], folder: Path) -> PolicyUnderTest
     It is written in those of the formats that hold every policy; one of a consumer alone holds its names and no others.
     """
     assert job.own is not None
-    job = replace(job, policy=job.own, own=None, profile=None)
+    job = replace(job, policy=job.own, own=None, profile=None, batch=None)
     contract = contract_of(job.policy, job.source, job.model, ReadOptions())
     artifacts = [f.artifact(job.policy, WriteOptions(contract.compact())) for f in formats if f.default]
     for artifact in artifacts:
@@ -211,7 +216,7 @@ def check_batch(options: ExportOptions, formats: Sequence[Format]) -> None:
     if options.profile is not None:
         raise UsageError(
             f"--batch does not go with --for {options.profile}",
-            why="ML-Agents feeds as many agents as ask for a decision",
+            why="the consumer decides for how many agents its files are",
             fix="leave one of them out",
         )
     if not any(f.fixed for f in formats):
@@ -235,10 +240,12 @@ def check_code(options: ExportOptions, formats: Sequence[Format]) -> None:
         )
 
 
-def fix_batch(job: Job, batch: int, formats: Sequence[Format]) -> Job:
-    """The policy of which some files are for ``batch`` agents at a time, which a note in its contract says."""
+def fix_batch(job: Job, batch: int, formats: Sequence[Format], flag: str = "--batch") -> Job:
+    """The policy of which some files are for ``batch`` agents at a time, as a note in its contract says, with the
+    ``flag`` that asked for it.
+    """
     files = " and ".join(f.main_of(job.policy.name) for f in formats if f.fixed)
-    note = f"made for batches of {batch}, no more and no fewer (--batch): {files}"
+    note = f"{FIXED_BATCH}{batch}, no more and no fewer ({flag}): {files}"
     signature = replace(job.policy.signature, notes=(*job.policy.signature.notes, note))
     return replace(job, policy=replace(job.policy, signature=signature), batch=batch)
 

@@ -21,11 +21,13 @@ def drop_passed_through(graph: Graph, options: CompileOptions, facts: SourceFact
     """Return the facts without the outputs that only hand on an input that nothing else reads, with a note on each.
 
     Every file of godot_rl (wrappers/onnx/stable_baselines_export.py, examples/clean_rl_*.py) has such a pair: its
-    exporter returns ``state_ins`` as ``state_outs``. What the user or the format gives a role is left alone.
+    exporter returns ``state_ins`` as ``state_outs``. What the user or the format gives a role is left alone, but for
+    the roles that say that nothing is known of it.
     """
     named = {normal_ref(n) for n in options.outputs} | {m.output for m in facts.memories or ()}
-    taken = {node_of(n) for n in (*options.inputs, *options.values, *facts.roles)}
-    open_outputs = [n for n, role in facts.outputs.items() if role is None and n not in named]
+    known = (n for n, role in facts.roles.items() if role is not Role.PARAMETER)
+    taken = {node_of(n) for n in (*options.inputs, *options.values, *known)}
+    open_outputs = [n for n, role in facts.outputs.items() if role in (None, Role.OTHER) and n not in named]
     echoes = {n: source for n in open_outputs if (source := fed_through(graph, n)) is not None and source not in taken}
     rest = [n for n in facts.outputs if n not in echoes]
     if not echoes or not any(n in depends_on_input(graph) for n in rest):

@@ -23,8 +23,12 @@ from converters.policy.facts import SourceFacts
 from signatures.contract import EMBEDDED, Contract, json_of, parse
 from signatures.errors import DamagedFileError
 from signatures.fields import FieldError
+from signatures.memories import SeparateMemory
 from signatures.roles import Role
 from signatures.spec import PolicySignature
+
+#: How the note begins of files that were made for a fixed number of agents; it is about the file, not the policy.
+FIXED_BATCH = "made for batches of "
 
 
 def with_contract(graph: Graph, contract: str) -> Graph:
@@ -102,8 +106,24 @@ def facts_of(graph: Graph, contract: Contract | None, nodes: Mapping[str, str] |
         constants=signature.constants,
         distributions={s.name: s.distribution for s in signature.inputs if s.distribution and s.name in graph},
         outputs=_outputs(graph, signature, nodes or {}),
-        notes=tuple(n for n in signature.notes if n not in found_again),
+        notes=tuple(n for n in signature.notes if n not in found_again and not n.startswith(FIXED_BATCH)),
         labels=signature.labels,
+        memories=_separate_memories(contract, nodes or {}) or None,
+    )
+
+
+def _separate_memories(contract: Contract, nodes: Mapping[str, str]) -> tuple[SeparateMemory, ...]:
+    """The parts of a memory in several tensors, or of three axes in a file for a fixed number of agents, whose batch
+    axis its shape does not tell; none of others, which their role tells.
+    """
+    signature = contract.signature
+    states = [signature.input(taken) for taken, _ in signature.recurrences]
+    if len(states) < 2 and not ("batch" in contract.tool and any(len(s.shape) > 2 for s in states)):
+        return ()
+    layout = () if signature.memory is None else signature.memory.layout
+    return tuple(
+        SeparateMemory(a, nodes.get(b, b), signature.input(a).shape, signature.output(b).shape, part)
+        for (a, b), part in zip(signature.recurrences, layout, strict=True)
     )
 
 

@@ -37,7 +37,8 @@ def understand(model: OnnxModel) -> tuple[Graph, SourceFacts]:
     text = model.metadata.get(EMBEDDED)
     if text is not None:
         contract = contract_of(text)
-        return redrawn(model.graph, contract), facts_of_contract(model.graph, contract, model.outputs)
+        facts = facts_of_contract(model.graph, contract, model.outputs)
+        return redrawn(model.graph, contract), replace(facts, rows=contract.tool.get("batch"))
     version = model.graph.constant(VERSION_NUMBER) if VERSION_NUMBER in model.graph else None
     number = 0 if version is None or version.size != 1 else int(version.reshape(()))
     graph, notes = _with_rows_first(model)
