@@ -21,7 +21,9 @@ class Profile:
     ``converters/consumers/unity/readings.py`` that must read every construct of the ONNX rightly, ``checkers`` the
     releases of ``converters/consumers/unity/consumers.py`` whose checks must accept it, ``players`` those whose player
     must play it. ``opset`` is the ONNX opset.
-    ``code`` is the snippet that says how to use its files.
+    ``code`` is the snippet that says how to use its files. ``loaders`` are those of
+    ``converters/consumers/robots/loaders.py`` whose rules the ONNX must meet. ``batch`` is the number of agents that
+    the files are for (None: any).
     """
 
     name: str
@@ -34,6 +36,8 @@ class Profile:
     checkers: tuple[str, ...] = ()
     players: tuple[str, ...] = ()
     code: str = "agent"
+    loaders: tuple[str, ...] = ()
+    batch: int | None = None
 
     @property
     def own_names(self) -> frozenset[str]:
@@ -47,7 +51,7 @@ class Profile:
             from converters.consumers.unity.readings import misread_ops
 
             misread = misread_ops(self.importers)
-        return WriteOptions(contract, self.opset, self.name, misread=misread)
+        return WriteOptions(contract, self.opset, self.name, misread=misread, batch=self.batch)
 
 
 def raise_profile_error(policy: Policy, profile: str, what: str, *, why: str, fix: str) -> NoReturn:

@@ -7,6 +7,7 @@ from functools import partial
 from converters.consumers.mlagents import version2, version3
 from converters.consumers.mlagents.tensorflowsharp import Generation, dress
 from converters.consumers.profile import Profile
+from converters.consumers.robots.naming import GODOT_RL, ISAAC_LAB, name_for_godot_rl, name_for_isaac_lab
 from converters.consumers.unity.consumers import releases_for
 from converters.formats.registry import BARRACUDA, FROZEN_GRAPH, ONNX
 from signatures.errors import UsageError, suggestion
@@ -83,6 +84,27 @@ PROFILES: tuple[Profile, ...] = (
         players=("1.9.1", "1.0.8"),
     ),
     *TFSHARP,
+    Profile(
+        name=ISAAC_LAB,
+        aliases=("rsl-rl",),
+        purpose="robots that run rsl_rl's exports (Isaac Lab, legged_gym): obs to actions, the mean, for one robot",
+        formats=(ONNX.key,),
+        dress=name_for_isaac_lab,
+        opset=11,
+        code="onnxruntime",
+        loaders=("Isaac Lab",),
+        batch=1,
+    ),
+    Profile(
+        name=GODOT_RL,
+        aliases=("godot",),
+        purpose="Godot RL Agents' plugin in Godot 4 .NET: obs and state_ins to output and state_outs, without chance",
+        formats=(ONNX.key,),
+        dress=name_for_godot_rl,
+        opset=17,
+        code="godot",
+        loaders=("Godot RL Agents",),
+    ),
 )
 
 

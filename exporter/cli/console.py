@@ -219,7 +219,10 @@ class Console:
             from exporter.tables import command_text
 
             wanted = known(profile)
-            say(f"next: put {files} of {last.folder} into a project of {wanted.purpose}")
+            place = f"give {files} of {last.folder} to {' and '.join(wanted.loaders)}"
+            if not wanted.loaders:
+                place = f"put {files} of {last.folder} into a project of {wanted.purpose}"
+            say(f"next: {place}")
             say(f"next: {command_text('snippets', last.folder, '--for', wanted.name)}    (what to set there)")
             return
         ours = results[-1].policy.signature.family.startswith("ML-Agents")

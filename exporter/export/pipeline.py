@@ -181,7 +181,10 @@ class Exporter:
             own = replace(policy, name=name)
             dressed = with_labels(own if dress is None else dress(own), self._labels)
             job = Job(source, model, dressed, self._profile, None if dress is None else own, note, code=options.code)
-            job = job if options.batch is None else fix_batch(job, options.batch, self._formats)
+            if options.batch is not None:
+                job = fix_batch(job, options.batch, self._formats)
+            elif self._profile is not None and self._profile.batch is not None:
+                job = fix_batch(job, self._profile.batch, self._formats, f"--for {self._profile.name}")
             jobs.append(job if options.weights == "float32" else smaller(job, options.weights))
         return jobs
 

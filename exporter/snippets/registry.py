@@ -9,7 +9,7 @@ from typing import Any
 
 from converters.formats.format import Code, Format
 from converters.formats.registry import BARRACUDA, FROZEN_GRAPH, ONNX, SAVED_MODEL, TFJS, WRITTEN
-from exporter.snippets import agent, csharp, javascript, python, serving, unity
+from exporter.snippets import agent, csharp, godot, javascript, python, serving, unity
 from exporter.snippets.contract import Bundle, string_literal
 from signatures.errors import BundleError, UsageError
 from signatures.records import dataclass
@@ -55,6 +55,7 @@ TARGETS: tuple[Target, ...] = (
         "internal-brain", "Unity, Internal Brain (ML-Agents 0.1 to 0.6)", "text", (FROZEN_GRAPH,), unity.internal_brain
     ),
     Target("inference-engine", "Unity Inference Engine (Sentis), C#", "csharp", (ONNX,), csharp.inference_engine),
+    Target("godot", "Godot RL Agents, an AIController, GDScript", "gdscript", (ONNX,), godot.godot),
     Target("agent", "Unity, an ML-Agents Agent, C#", "csharp", (ONNX, BARRACUDA), agent.agent),
 )
 

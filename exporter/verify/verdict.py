@@ -141,9 +141,16 @@ def _enumerate_names(names: Sequence[str]) -> str:
 
 
 def _checkers(says: Sequence[Finding]) -> str:
-    """Unity's checks that accept it, by release; empty where none was asked."""
+    """Unity's checks that accept it, by release, or the loader whose rules do; empty where none was asked."""
     names = _releases([c for c in says if not isinstance(c, Played)])
-    return f"Unity's checks ({_release(names)})" if names else ""
+    return "" if not names else _loaders(names) or f"Unity's checks ({_release(names)})"
+
+
+def _loaders(names: Sequence[str]) -> str:
+    """The loaders outside Unity among those that were asked."""
+    from converters.consumers.robots.loaders import LOADERS
+
+    return " and ".join(f"the rules of {name}'s loader" for name in names if name in LOADERS)
 
 
 def _players(says: Sequence[Finding]) -> str:
@@ -178,6 +185,9 @@ def _wrong(report: ParityReport) -> list[str]:
         (Accepted, "refused by Unity's checks: {}"),
         (Size, "too large: {}"),
     ):
+        if kind is Accepted and (by := _loaders([c.runtime for c in failed if type(c) is kind])):
+            told.append(f"refused by {by}")
+            continue
         names = [c.output if kind is Decisions else c.runtime if issubclass(kind, Accepted) else
                  c.format if kind is Size else c.where for c in failed if type(c) is kind]  # fmt: skip
         told += [words.format(", ".join(dict.fromkeys(names)))] if names else []

@@ -138,7 +138,7 @@ def _as_colours(dressing: Dressing, name: str, tensor: str, done: Mapping[str, o
 def _unknown_length(dressing: Dressing, spec: TensorSpec) -> NoReturn:
     dressing.refuse(
         f"the shape of its observation {spec.name} is {list(spec.shape)}",
-        why="Unity compares the lengths of a sensor with those of the model's input",
+        why="the consumer compares the lengths of a sensor with those of the model's input",
         fix="export the model again with all lengths but the batch fixed",
     )
 

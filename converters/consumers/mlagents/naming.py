@@ -76,15 +76,17 @@ class Dressing:
             tensor = self.builder.add("Reshape", [tensor, self.builder.ints(dims, "shape")], f"{spec.name}/as_taken")
         self.tensors[self.policy.feeds[spec.name]] = tensor
 
-    def take_over(self, draws: Callable[[TensorSpec], str]) -> None:
-        """Append the policy's graph behind the inputs; ``draws`` makes what stands for an input of noise.
+    def take_over(self, draws: Callable[[TensorSpec], str] | None) -> None:
+        """Append the policy's graph behind the inputs; ``draws`` makes what stands for an input of noise (None: zeros,
+        where no draw is wanted).
 
         What does not hang on noise comes first, so that a draw can be of the shape of something computed.
         """
         graph = self.policy.graph
         noise = {self.policy.feeds[s.name]: s for s in self.policy.signature.noise}
         noise = {placeholder: spec for placeholder, spec in noise.items() if placeholder not in self.tensors}
-        self.notes.extend(f"{spec.name} is drawn inside the model, new at every step" for spec in noise.values())
+        if draws is not None:
+            self.notes.extend(f"{spec.name} is drawn inside the model, new at every step" for spec in noise.values())
         behind: set[str] = set(noise)
         later = []
         for node in graph.nodes:
@@ -96,7 +98,8 @@ class Dressing:
             else:
                 self._keep(node)
         for placeholder, spec in noise.items():
-            self.tensors[placeholder] = draws(spec)
+            zeros = np.zeros([d or 1 for d in spec.shape], np.float32)
+            self.tensors[placeholder] = self.builder.floats(zeros, spec.name) if draws is None else draws(spec)
         for node in later:
             self._keep(node)
 

@@ -86,7 +86,8 @@ def branches(dressing: Dressing, spec: TensorSpec, masks: str | None, *, masked:
         samples = None if samples is None else _columns(dressing, samples, len(sizes))
         best = None if best is None else _columns(dressing, best, len(sizes))
     if spec.role is Role.DETERMINISTIC:
-        dressing.notes.append("the policy does not draw: discrete_actions is the best action, with and without chance")
+        if masked:
+            dressing.notes.append("the policy does not draw: the action is the best one, with and without chance")
         samples = best = best or builder.concat([_best(dressing, s) for s in scores], 1)
     return Branches(scores, sizes, samples, best)
 

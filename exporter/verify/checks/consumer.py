@@ -29,8 +29,17 @@ def consumers(name: str | None, files: Mapping[str, Path], *, memory: bool = Fal
     from converters.consumers.profiles import profile
     from converters.consumers.unity.checker import check_file
     from converters.consumers.unity.consumers import consumer
+    from converters.formats.registry import ONNX
 
     wanted = profile(name)
+    for loader in wanted.loaders:
+        from converters.consumers.robots.interface import interface_of
+        from converters.consumers.robots.loaders import LOADERS
+        from converters.consumers.unity.onnx_file import read_onnx_file
+
+        file = interface_of(read_onnx_file(files[ONNX.key]).model)
+        faults = [f"{rule.says} ({rule.evidence})" for rule in LOADERS[loader].faults(file)]
+        yield _finding(Accepted, ONNX.key, loader, faults)
     for release in dict.fromkeys((*wanted.checkers, *wanted.players)):
         asked = consumer(release)
         for key in (k for k in asked.formats if k in files):
