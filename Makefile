@@ -9,7 +9,7 @@ PYTEST := $(BIN)/python -m pytest
 # Where the machine forbids it, each of hundreds of processes would compile all modules anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: install browser compiler demo check test lint types docs figures pictures bench fuzz train clean help
+.PHONY: install browser compiler demo check test lint types docs gallery figures pictures bench fuzz train clean help
 
 help:
 	@echo "make install   .venv with every extra, and the locked npm packages"
@@ -17,6 +17,7 @@ help:
 	@echo "make check     lint, types and the tests that start no runtime: two minutes, for the daily loop"
 	@echo "make test      lint, types and all tests (installs Chromium, gcc and Mono where apt-get can)"
 	@echo "make docs      the documentation as a site in build/docs"
+	@echo "make gallery   five trained policies that act in a browser, as a static folder in build/gallery"
 	@echo "make figures   docs/figures.md anew, from ../shared (minutes), and docs/consumers.md"
 	@echo "make pictures  the pictures of the page and of a report in docs/pictures, anew, from Chromium (minutes)"
 	@echo "make bench     speed, memory and size beside what a user would run instead"
@@ -73,6 +74,11 @@ check: lint types
 test: install
 	$(MAKE) --jobs 2 browser compiler lint types # one fetches, the others compute
 	$(PYTEST) -n 2 --dist loadgroup --cov --cov-report=term:skip-covered --cov-fail-under=90 --durations=25
+
+# Five policies of fixtures/trained as a static folder: a file for each, and an index.
+gallery: install
+	$(BIN)/export-model $(addprefix fixtures/trained/,3DBall GridWorld Hallway Tennis Crawler2D) -o build/policies --to bytes,tfjs --verify tensorflow
+	$(BIN)/export-model serve build/policies -o build/gallery
 
 docs: install
 	$(BIN)/python -m sphinx --builder html --fail-on-warning --keep-going --quiet docs build/docs

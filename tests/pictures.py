@@ -1,4 +1,5 @@
-"""``python -m tests.pictures``: in docs/pictures page.png and crawler.png, which move, and report.png, from Chromium.
+"""``python -m tests.pictures``: in docs/pictures page.png and crawler.png, which move, and report.png, from Chromium;
+in exporter/serve/previews a still of each environment, for the gallery.
 
 The moving ones are APNGs: one palette for all frames, and in each frame only what changed since the last.
 """
@@ -16,6 +17,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from converters.formats.bundle.bundle import Bundle
+from exporter.serve.gallery import PREVIEWS
+from exporter.serve.scenes import scene_of
 from exporter.serve.site import assemble_one_file
 from fixtures.trained import run_folder
 from tests.commands import export_model
@@ -40,8 +44,13 @@ def main() -> None:
         report.write_text(report.read_text(encoding="utf-8").replace(scratch, "exported"), encoding="utf-8")
         ran = export_model(run_folder("Crawler2D"), "-o", folder, "--to", "bytes,tfjs", "--verify", "none")
         assert ran.status == 0, ran.err
-        save("page.png", moving(folder / "3DBall", "#beside=untrained", ".stage", steps=5))
-        save("crawler.png", moving(folder / "Crawler2D", "", ".lanes", steps=2))
+        save("page.png", moving(folder / "3DBall", "", ".lanes", steps=13))
+        save("crawler.png", moving(folder / "Crawler2D", "#beside=nothing", ".lanes", steps=2))
+        for name in ("GridWorld", "Hallway", "Tennis"):
+            ran = export_model(run_folder(name), "-o", folder, "--to", "bytes,tfjs", "--verify", "none")
+            assert ran.status == 0, ran.err
+        for name in ("3DBall", "Crawler2D", "GridWorld", "Hallway", "Tennis-LeftBrain"):
+            still(folder / name)
         seen = visit(report.as_uri(), [["pixels", "body"]], viewport={"width": 1100, "height": 900})
         save("report.png", animated([pixels(seen.results[0])[:1100]]))
 
@@ -55,7 +64,7 @@ def moving(bundle: Path, fragment: str, selector: str, *, steps: int) -> bytes:
         ["eval", "new Promise((done) => setTimeout(done, 120))"],
         ["pixels", selector],
     ]
-    ready = ["wait", f"document.querySelector('#status{'-2' if 'beside' in fragment else ''}') !== null"]
+    ready = ["wait", f"document.querySelector('#status{'' if fragment else '-2'}') !== null"]
     hide = ["eval", "document.querySelectorAll('.stage .controls').forEach((e) => (e.hidden = true))"]
     seen = visit(
         page.as_uri() + fragment,
@@ -64,6 +73,23 @@ def moving(bundle: Path, fragment: str, selector: str, *, steps: int) -> bytes:
         reducedMotion="reduce",
     )
     return animated([pixels(r) for r in seen.results if isinstance(r, dict)])
+
+
+def still(bundle: Path) -> None:
+    """A picture of a bundle's environment, 640 pixels wide, as exporter/serve/previews has it."""
+    page = bundle.with_suffix(".html")
+    page.write_bytes(assemble_one_file(bundle))
+    steps = ["eval", "{ for (let n = 0; n < 90; n++) document.querySelector('#step').click() }"]
+    wait, shown = ["eval", "new Promise((done) => setTimeout(done, 900))"], ["pixels", "#canvas"]
+    ready = ["wait", "document.querySelector('#step') !== null"]
+    here = {"width": 696, "height": 900}
+    seen = visit(f"{page.as_uri()}#beside=nothing", [ready, steps, wait, shown], viewport=here, reducedMotion="reduce")
+    bound = Bundle.open(bundle)
+    scene = scene_of(bound.name, bound.signature)
+    assert scene is not None
+    data = animated([pixels(seen.results[-1])])
+    (PREVIEWS / f"{scene.id}.png").write_bytes(data)
+    print(f"exporter/serve/previews/{scene.id}.png: {len(data) / 1000:.0f} kB")
 
 
 def save(name: str, data: bytes) -> None:

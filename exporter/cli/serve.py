@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -23,6 +23,7 @@ _SCENES = ("auto", "ball3d", "crawler2d", "gridworld", "hallway", "tennis", "non
     ("export-model serve 3DBall.onnx", "exported for the page"),
     ("export-model serve exported/3DBall -o page.html", "one file, to open or send"),
     ("export-model serve exported/3DBall -o site", "files for any web server"),
+    ("export-model serve exported -o gallery", "a page for each policy, and an index"),
 )
 @click.argument("bundle", type=PATH, metavar="BUNDLE|SOURCE")
 @click.option("--host", default="127.0.0.1", help="Address to listen on.")
@@ -37,10 +38,15 @@ _SCENES = ("auto", "ball3d", "crawler2d", "gridworld", "hallway", "tennis", "non
 )
 def serve_command(bundle: Path, host: str, port: int, opens: bool, out: Path | None, scene: str) -> None:
     """A page where the policy acts in your browser: its environment if it is a known one, else a panel of sliders."""
+    from converters.formats.bundle.bundle import bundles_in
     from exporter.serve.site import assemble, assemble_one_file, write_file, write_site
 
     if out is not None and opens:
         raise UsageError("--out and --open contradict each other", fix="open what is written, or leave --out out")
+    many = bundles_in(bundle)
+    if len(many) > 1:
+        _gallery(many, out, scene, host, port, opens)
+        return
     if out is not None and out.suffix.casefold() in (".html", ".htm"):
         with _bundle_of(bundle) as folder:
             page = assemble_one_file(folder, scene)
@@ -55,6 +61,11 @@ def serve_command(bundle: Path, host: str, port: int, opens: bool, out: Path | N
         say(f"wrote {out}: {len(site)} files, {sum(map(len, site.values())) / 1e6:.1f} MB")
         say(f"next: host it anywhere, or: python -m http.server --directory {out}")
         return
+    _serve(site, host, port, opens)
+
+
+def _serve(site: Mapping[str, bytes], host: str, port: int, opens: bool) -> None:
+    """Serve until Ctrl-C."""
     from exporter.serve.server import interrupts, listening
 
     with listening(site, host, port) as server, interrupts() as told:
@@ -65,6 +76,32 @@ def serve_command(bundle: Path, host: str, port: int, opens: bool, out: Path | N
             webbrowser.open(server.url)
         server.answer_until(told)
     say("ended")
+
+
+def _gallery(folders: Sequence[Path], out: Path | None, scene: str, host: str, port: int, opens: bool) -> None:
+    """The gallery of a folder of bundles, served or written."""
+    from exporter.serve.gallery import assemble_gallery
+    from exporter.serve.site import write_site
+    from exporter.tables import command_text, count_text
+
+    if scene != "auto":
+        raise UsageError(f"--scene {scene} goes with a single bundle", fix=command_text("serve", folders[0]))
+    if out is not None and out.suffix.casefold() in (".html", ".htm"):
+        raise UsageError(
+            f"{len(folders)} bundles do not fit into {out}",
+            why="a page of one file shows one policy",
+            fix=f"choose one: {command_text('serve', folders[0], '-o', out)}, or give a folder: -o gallery",
+        )
+    gallery = assemble_gallery(folders, whole=out is None)
+    for error in gallery.left_out:
+        say(f"left out: {error}", err=True)
+    if out is None:
+        _serve(gallery.files, host, port, opens)
+        return
+    write_site(gallery.files, out)
+    size = sum(map(len, gallery.files.values()))
+    say(f"wrote {out}: {count_text(len(gallery.shown), 'page')} and an index, {size / 1e6:.1f} MB")
+    say(f"next: host it anywhere, or: python -m http.server --directory {out}")
 
 
 @contextmanager

@@ -35,6 +35,7 @@ TYPES: Mapping[str, str] = {
     ".wasm": "application/wasm",
     ".bin": "application/octet-stream",
     ".svg": "image/svg+xml",
+    ".png": "image/png",
 }
 #: Of these, what is data and nothing else: a bundle's files are served under no other name.
 DATA = (".json", ".bin")
@@ -210,7 +211,8 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         """A file of the site; of HEAD its headers alone."""
-        name = unquote(urlsplit(self.path).path).removeprefix("/") or INDEX
+        name = unquote(urlsplit(self.path).path).removeprefix("/")
+        name += INDEX if name == "" or name.endswith("/") else ""
         body = self.server.site.get(name)
         if body is None:
             self.send_error(HTTPStatus.NOT_FOUND)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import html
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path, PurePosixPath
@@ -20,7 +22,7 @@ from exporter import __version__
 from exporter.serve.scenes import AUTO, Scene, other_side, scene_of
 from exporter.serve.selftest import golden
 from exporter.serve.server import DATA, INDEX, TYPES
-from signatures.contract import POLICY
+from signatures.contract import PARITY, POLICY
 from signatures.errors import BundleError, RuntimeUnavailableError, naming
 from signatures.records import dataclass
 
@@ -33,6 +35,8 @@ SITE = "site.json"
 MADE_BY = "export-model serve"
 #: ... and a page of one file.
 MARK = f'<meta name="generator" content="{MADE_BY}">'.encode()
+#: More than any report of a policy that has a page.
+_MOST_REPORT_BYTES = 32_000_000
 #: Bytes at the beginning of a page of one file, among which the mark is.
 _HEAD = 2000
 
@@ -95,9 +99,9 @@ def assemble(folder: Path, scene: str = AUTO) -> dict[str, bytes]:
     return site
 
 
-def assemble_one_file(folder: Path, scene: str = AUTO) -> bytes:
-    """The page as one HTML file, which needs no server and no network, on its own kernels. Raises as ``assemble``,
-    and DamagedFileError.
+def assemble_one_file(folder: Path, scene: str = AUTO, *, picture: str | None = None) -> bytes:
+    """The page as one HTML file, which needs no server and no network, on its own kernels; ``picture`` lies beside it,
+    for messengers that show one with a link. Raises as ``assemble``, and DamagedFileError.
     """
     from exporter.serve.onefile import one_file
 
@@ -108,6 +112,9 @@ def assemble_one_file(folder: Path, scene: str = AUTO) -> bytes:
         site.pop(place.pop(ONNX.key, ""), None)
     absent = [{"name": "TensorFlow.js", "why": "a page of one file runs on its own kernels alone"}]
     site[SITE] = dumps({**said, "tfjs": None, "backends": [_JS], "absent": absent})
+    if picture is not None:
+        tag = f'<meta property="og:image" content="{html.escape(picture)}">\n</head>'
+        site[INDEX] = site[INDEX].replace(b"</head>", tag.encode(), 1)
     with naming(folder):
         return one_file(site)
 
@@ -138,6 +145,7 @@ def _content(folder: Path, scene: str) -> tuple[dict[str, bytes], dict[str, Any]
         said, data = golden(policy.signature, graph)
     site["golden.json"], site["golden.bin"] = f"{json.dumps(said, separators=(',', ':'))}\n".encode(), data
     site["policy.json"] = dumps(policy.content)
+    site[INDEX] = describe_page(site[INDEX], policy.name, policy.signature.family, found is not None)
     return site, {
         "made_by": MADE_BY,
         "version": __version__,
@@ -148,7 +156,36 @@ def _content(folder: Path, scene: str) -> tuple[dict[str, bytes], dict[str, Any]
         "tfjs": package_version(js_home(), _TFJS),
         "models": models,
         "model_bytes": size,
+        "original": _original(policy),
     }
+
+
+def _original(policy: Bundle) -> str | None:
+    """What the bundle agreed with when it was exported, in words; None where its report does not say so."""
+    from converters.runtimes.pool import INDEPENDENT
+    from exporter.verify.verdict import runtime_title
+
+    try:
+        with (policy.folder / PARITY).open("rb") as file:
+            report = json.loads(file.read(_MOST_REPORT_BYTES))
+    except (OSError, ValueError, RecursionError):
+        return None
+    original = report.get("original") if isinstance(report, dict) and report.get("passed") is True else None
+    return runtime_title(original) if original in INDEPENDENT else None
+
+
+def describe_page(page: bytes, name: str, family: str, acts: bool) -> bytes:
+    """Return index.html with a title and a description, which messengers show of a link."""
+    where = "acts in your browser, beside the same network untrained" if acts else "answers in your browser"
+    text = html.escape(f"A trained policy ({family}) {where}. Its answers are checked on your own machine.")
+    title = html.escape(f"{name} · export-model")
+    tags = (
+        f'<title>{title}</title>\n<meta name="description" content="{text}">\n'
+        f'<meta property="og:title" content="{title}">\n<meta property="og:description" content="{text}">\n'
+        '<meta property="og:type" content="website">\n'
+    )
+    head, _, rest = page.decode().partition("<title>")
+    return (head + tags + rest.partition("\n")[2].partition("\n")[2]).encode()
 
 
 def _asking_at_once(site: Mapping[str, bytes]) -> bytes:
@@ -264,6 +301,7 @@ def _vendor(onnx: bool) -> tuple[dict[str, bytes], list[dict[str, Any]], list[di
     return files, backends, absent
 
 
+@functools.cache
 def _dist(home: Path, package: str, file: str) -> bytes:
     try:
         return _without_map((home / "node_modules" / package / "dist" / file).read_bytes())

@@ -17,6 +17,11 @@ _APART = ("reference", "golden", "source", "weights")
 _TITLES = {"tensorflow": "TensorFlow"}
 
 
+def runtime_title(name: str) -> str:
+    """Return what people call a runtime."""
+    return _TITLES.get(name, name)
+
+
 def key_of(label: str) -> str:
     """Return the format of a comparison's label: of one signature, or of one file of several."""
     return label.split(" ")[0].partition(":")[0]
@@ -76,7 +81,7 @@ def verdict(report: ParityReport) -> str:
 def reference_text(report: ParityReport) -> str:
     """Return what all was compared with, in words."""
     if report.original is not None:
-        return f"the original in {_TITLES.get(report.original, report.original)}"
+        return f"the original in {runtime_title(report.original)}"
     if "/" in report.reference:
         return f"the bundle's own .{report.reference.partition('/')[0]}"
     if report.self_consistent:

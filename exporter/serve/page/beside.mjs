@@ -77,7 +77,7 @@ export async function dropped(items, onnxruntime) {
   }
   const onnx = find(".onnx");
   if (onnx === undefined) throw new Error("it has neither a tfjs/model.json nor an .onnx");
-  if (onnxruntime === undefined) throw new Error("an .onnx needs onnxruntime-web, which this page has not: drop the bundle's folder");
+  if (onnxruntime === undefined) throw new Error("an .onnx needs onnxruntime-web, which is not in this page: drop the bundle's folder");
   const bytes = await files.get(onnx).arrayBuffer();
   return policy(bytes, metadata(new Uint8Array(bytes), EMBEDDED), withOnnx(onnxruntime));
 }

@@ -1,6 +1,6 @@
 /** Numbers as bars and as a strip of colours. The bars are tables, so that a screen reader reads names and values. */
 
-import { h, text } from "./dom.mjs";
+import { fixed, h, text } from "./dom.mjs";
 
 /** Rows of a name, a bar and a value. `from` is where bars start: "zero" in the middle, or "left" for 0 to 1. */
 export class Bars {
@@ -32,7 +32,7 @@ export class Bars {
   }
 
   /** @param {number} chosen the row to mark, if any */
-  show(values, { chosen = -1, write = text } = {}) {
+  show(values, { chosen = -1, write = fixed } = {}) {
     for (const v of values) if (Number.isFinite(v)) this.#most = Math.max(this.#most, Math.abs(v));
     this.#rows.forEach(({ row, fill, value }, i) => {
       const share = Number.isFinite(values[i]) ? Math.min(Math.abs(values[i]) / this.#most, 1) : 0;

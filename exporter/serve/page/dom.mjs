@@ -28,6 +28,12 @@ export function text(value, digits = 3) {
   return written.replaceAll("-", "−");
 }
 
+/** A number with a fixed count of decimals, which does not jump when it changes. */
+export function fixed(value, decimals = 3) {
+  if (!Number.isFinite(value) || Math.abs(value) >= 1e5) return text(value, decimals);
+  return value.toFixed(Math.abs(value) >= 100 ? 1 : decimals).replace(/^-(?=[0.]*$)/, "").replace("-", "−");
+}
+
 export const milliseconds = (value) => `${value < 10 ? value.toFixed(2) : value.toFixed(1)} ms`;
 
 export const frame = () => new Promise((resolve) => requestAnimationFrame(resolve));

@@ -4,7 +4,7 @@ import { $, h } from "./dom.mjs";
 import { isOneFile, json } from "./files.mjs";
 import { Host } from "./host.mjs";
 import { asked, tell } from "./link.mjs";
-import { Names } from "./names.mjs";
+import { engine, Names } from "./names.mjs";
 import { Panel } from "./panel.mjs";
 import { Stage } from "./stage.mjs";
 import { Verdict } from "./verdict.mjs";
@@ -24,7 +24,7 @@ async function started(host, backends) {
       await host.start(backend);
       return;
     } catch (error) {
-      failed.push(`${backend}: ${error.message}`);
+      failed.push(`${engine(backend)}: ${error.message}`);
     }
   }
   throw new Error(`nothing runs the policy here (${failed.join("; ")})`);
@@ -42,13 +42,13 @@ function header(site, contract) {
     `${(site.model_bytes / 1000).toFixed(0)} kB`,
   ];
   $("facts").textContent = facts.filter(Boolean).join(" · ");
-  const runs = site.tfjs === null || isOneFile ? "its own kernels" : `its own kernels and TensorFlow.js ${site.tfjs}`;
+  const runs = site.tfjs === null || isOneFile ? "its own code" : `its own code and TensorFlow.js ${site.tfjs}`;
   $("footer").textContent = `Written by export-model ${site.version}, runs ${runs} in this page. Nothing leaves your browser.`;
 }
 
 function chooser(site, host, after) {
   const select = $("backend");
-  select.append(...site.backends.map(({ name }) => h("option", { value: name, selected: name === host.backend }, name)));
+  select.append(...site.backends.map(({ name }) => h("option", { value: name, selected: name === host.backend }, engine(name))));
   select.disabled = false;
   select.addEventListener("change", async () => {
     const wanted = select.value;
@@ -59,7 +59,7 @@ function chooser(site, host, after) {
       tell("on", wanted);
       after();
     } catch (error) {
-      problem(`${wanted} cannot be used: ${error.message}. The policy stays on ${host.backend}.`);
+      problem(`${engine(wanted)} cannot be used: ${error.message}. The policy stays on ${engine(host.backend)}.`);
     }
     select.value = host.backend;
     select.disabled = false;
@@ -85,7 +85,7 @@ async function main() {
   // First it plays. What takes time, the panel and the check, begins once it has moved.
   if (!matchMedia("(prefers-reduced-motion: reduce)").matches) await stage?.play();
   const panel = new Panel(host, names, { folded: view !== null });
-  const verdict = new Verdict(host, site.backends, site.absent);
+  const verdict = new Verdict(host, site);
   chooser(site, host, () => {
     void panel.decide();
     stage?.retitle();

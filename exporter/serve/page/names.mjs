@@ -1,3 +1,14 @@
+/** What engines are called, in the order in which people know them. */
+const ENGINES = {
+  js: "this page's own code",
+  cpu: "TensorFlow.js (JavaScript)",
+  wasm: "TensorFlow.js (WebAssembly)",
+  webgl: "TensorFlow.js (WebGL)",
+  webgpu: "TensorFlow.js (WebGPU)",
+  "onnxruntime-web": "ONNX Runtime Web",
+};
+export const engine = (name) => ENGINES[name] ?? name;
+
 /** What observations and actions are called: by policy.json's labels, else by the scene, else by number. */
 
 export class Names {

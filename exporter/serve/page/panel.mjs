@@ -3,6 +3,7 @@
 import { Bars, percent, Strip } from "./charts.mjs";
 import { $, coalesced, h, milliseconds, newId, text } from "./dom.mjs";
 import { Masks, Memory, Picture, Previous, Vector } from "./inputs.mjs";
+import { engine } from "./names.mjs";
 import { probabilities } from "./player.mjs";
 
 export class Panel {
@@ -193,7 +194,7 @@ export class Panel {
         return [h("dt", {}, name), h("dd", {}, words)];
       }),
     );
-    this.#timing.textContent = `Decided in ${milliseconds(took)} on ${this.#host.backend}.`;
+    this.#timing.textContent = `Decided in ${milliseconds(took)} on ${engine(this.#host.backend)}.`;
   }
 }
 

@@ -7,6 +7,7 @@ import { canRecord, Film } from "./film.mjs";
 import { Hand } from "./hand.mjs";
 import { apart, Lane } from "./lane.mjs";
 import { asked, tell } from "./link.mjs";
+import { engine } from "./names.mjs";
 import { probabilities } from "./player.mjs";
 import { Streams } from "./scenes/base.mjs";
 import { palette } from "./views/drawing.mjs";
@@ -20,6 +21,8 @@ const NUMBERS_EVERY = 100;
 const TEXT_EVERY = 2000;
 /** Until somebody touches the scene, something happens in it by itself: every so many seconds. */
 const GUST_EVERY = 5;
+/** What stands beside the policy until somebody chooses something else. */
+const UNTRAINED = "untrained";
 
 export class Stage {
   #view;
@@ -55,8 +58,8 @@ export class Stage {
       this.#draw(1);
     });
     this.#begin();
-    const other = asked("beside");
-    if (backends.some(({ name }) => name === other) || other === "untrained") void this.#compare(other);
+    const other = asked("beside") ?? UNTRAINED;
+    if (backends.some(({ name }) => name === other) || other === UNTRAINED) void this.#compare(other);
   }
 
   /** Simulated seconds since the last reset. */
@@ -90,40 +93,37 @@ export class Stage {
     const exact = h("input", { type: "checkbox", id: "exact", checked: true });
     exact.addEventListener("change", () => this.#players().forEach((player) => (player.deterministic = exact.checked)));
     const beside = h("select", { id: "beside", onchange: () => void this.#compare(beside.value) });
-    const others = [["", "nothing"], ["untrained", "the same, untrained"], ...backends.map(({ name }) => [name, `the same, on ${name}`])];
+    const others = [[UNTRAINED, "itself, untrained"], ["", "nothing"], ...backends.map(({ name }) => [name, `itself, on ${engine(name)}`])];
     beside.append(...others.map(([value, words]) => h("option", { value }, words)));
     const lanes = h("div", { class: "lanes" });
     const divergence = new Divergence();
     const said = h("p", { id: "said", class: "soft", role: "status" });
     Object.assign(this.#parts, { speed, exact, beside, lanes, divergence, said });
     $("scene").append(
-      h("h2", { id: "scene-title" }, `At work in ${view.name}`),
-      h("p", { class: "lead" }, view.story),
+      h("h2", { id: "scene-title", class: "hidden" }, `At work in ${view.name}`),
       h(
         "div",
-        { class: "columns" },
+        { class: "stage" },
+        lanes,
         h(
           "div",
-          { class: "stage" },
-          lanes,
-          divergence.element,
-          h(
-            "div",
-            { class: "controls" },
-            button("pause", "Play", () => this.#pause(!this.#paused)),
-            button("step", "Step", () => this.#stepOnce()),
-            button("reset", "Reset", () => this.#queued(() => this.#begin(this.#seed + 1))),
-            view.poke && button("poke", view.poke, () => this.#queued(() => this.#poke())),
-            h("span", { class: "field" }, h("label", { for: "speed" }, "Speed"), speed),
-            h("span", { class: "field" }, exact, h("label", { for: "exact" }, "Deterministic")),
-            h("span", { class: "field" }, h("label", { for: "beside" }, "Compare with"), beside),
-            button("copy", "Copy link", () => this.#copy()),
-            canRecord() && button("record", "Record", () => this.#record()),
-          ),
-          said,
+          { class: "controls" },
+          button("pause", "Play", () => this.#pause(!this.#paused)),
+          button("step", "Step", () => this.#stepOnce()),
+          button("reset", "Reset", () => this.#queued(() => this.#begin(this.#seed + 1))),
+          view.poke && button("poke", view.poke, () => this.#queued(() => this.#poke())),
+          h("span", { class: "field" }, h("label", { for: "speed" }, "Speed"), speed),
+          h("span", { class: "field" }, exact, h("label", { for: "exact" }, "Deterministic")),
+          h("span", { class: "field" }, h("label", { for: "beside" }, "Compare with"), beside),
+          button("copy", "Copy link", () => this.#copy()),
+          canRecord() && button("record", "Record", () => this.#record()),
         ),
-        h("div", { class: "numbers" }, this.#chooser(), this.#numbers(names)),
+        said,
+        h("p", {}, view.story),
+        h("p", { class: "soft", id: "droppable" }, this.#droppable()),
+        divergence.element,
       ),
+      h("div", { class: "numbers side-by-side" }, this.#chooser(), this.#numbers(names)),
     );
     this.#addCanvas();
     const touch = () => (this.#touched = true);
@@ -138,8 +138,9 @@ export class Stage {
     const id = (name) => (number === 0 ? name : `${name}-${number + 1}`);
     const canvas = h("canvas", { id: id("canvas"), class: "scene", role: "img", "aria-label": this.#view.name });
     const status = h("p", { id: id("status"), class: "status" });
-    const title = h("p", { class: "title" });
-    const element = h("div", { class: "lane" }, title, canvas, status);
+    const title = h("span", { class: "title" });
+    const count = h("span", { class: "count" });
+    const element = h("div", { class: "lane" }, h("p", { class: "heading" }, title, count), canvas, status);
     const fit = () => {
       const width = canvas.clientWidth;
       const height = Math.round(width / this.#view.ratio(width));
@@ -148,7 +149,7 @@ export class Stage {
       [canvas.width, canvas.height] = [Math.round(width * density), Math.round(height * density)];
       this.#draw(1);
     };
-    this.#parts.canvases.push({ canvas, status, title, element });
+    this.#parts.canvases.push({ canvas, status, title, count, element });
     this.#parts.lanes.append(element);
     new ResizeObserver(() => canvas.clientWidth > 0 && fit()).observe(canvas);
     const hand = new Hand(canvas, this.#view, {
@@ -204,7 +205,7 @@ export class Stage {
         this.#players().forEach((player) => (player.deterministic = this.#parts.exact.checked));
         this.#begin();
       });
-      tell("beside", what === "" || given !== null ? null : what);
+      tell("beside", given !== null || what === UNTRAINED ? null : what || "nothing");
     } catch (error) {
       this.#parts.beside.value = this.#beside?.what ?? "";
       this.#say(`It cannot be compared: ${error.message}.`);
@@ -213,7 +214,13 @@ export class Stage {
 
   async #other(what) {
     if (what === "") return null;
-    return what === "untrained" ? untrained(this.#host.source().artifacts) : this.#host.policyOn(what);
+    return what === UNTRAINED ? untrained(this.#host.source().artifacts) : this.#host.policyOn(what);
+  }
+
+  /** What may be dropped, said before somebody tries: an .onnx is run by onnxruntime-web, which one file does not hold. */
+  #droppable() {
+    if (this.#large) return "Drop the folder of a bundle here to compare it, or an .onnx that export-model wrote.";
+    return "Drop the folder of a bundle here to compare it. This page runs no .onnx: that takes onnxruntime-web.";
   }
 
   #takeDrops() {
@@ -282,16 +289,20 @@ export class Stage {
   retitle() {
     this.#parts.canvases.forEach(({ element, title }, i) => {
       element.hidden = i >= this.#lanes.length;
-      title.hidden = this.#lanes.length === 1;
-      title.textContent = i === 0 ? `This policy, on ${this.#host.backend}` : this.#titled();
+      title.textContent = i === 0 ? this.#ownTitle() : this.#titled();
     });
     this.#parts.divergence.element.hidden = this.#lanes.length === 1;
+  }
+
+  #ownTitle() {
+    const what = this.#beside?.what ?? UNTRAINED;
+    return what === UNTRAINED || what === "" ? "Trained" : `On ${engine(this.#host.backend)}`;
   }
 
   #titled() {
     if (this.#beside === null) return "";
     const { what, name } = this.#beside;
-    return what === "untrained" ? "The same network, untrained" : what === "" ? `${name} (dropped here)` : `The same, on ${name}`;
+    return what === UNTRAINED ? "Untrained" : what === "" ? `${name} (dropped here)` : `On ${engine(name)}`;
   }
 
   #poke() {
@@ -401,8 +412,12 @@ export class Stage {
     if (now - this.#shown.numbers > NUMBERS_EVERY || this.#shown.numbers === 0) {
       this.#shown.numbers = now;
       const time = this.#view.stepSeconds < 0.1 ? `${this.seconds.toFixed(1)} s` : `${this.#lanes[0].tally.steps} steps`;
-      this.#canvases().forEach(({ status }, i) => {
+      this.#canvases().forEach(({ status, count }, i) => {
         const { env, tally } = this.#lanes[i];
+        count.textContent = this.#view.count(tally, env);
+        const failed = this.#view.failed?.(tally) ?? tally.bad;
+        count.classList.toggle("fail", failed > 0);
+        count.classList.toggle("ok", failed === 0 && i === 0);
         status.textContent = `${this.#view.status(env, tally)} · ${time} played`;
         Object.assign(status.dataset, { seconds: this.seconds, good: tally.good, bad: tally.bad });
       });

@@ -2,6 +2,7 @@
 
 import { $, h, milliseconds, text } from "./dom.mjs";
 import { check, readGolden, visitor } from "./golden.mjs";
+import { engine } from "./names.mjs";
 
 const RULE = "|a − b| ≤ 1e-5 + 1e-5·|b|";
 
@@ -12,9 +13,11 @@ export class Verdict {
   #results = [];
   #button = h("button", { type: "button", disabled: true, onclick: () => this.run() }, "Check again");
 
-  constructor(host, backends, absent) {
+  constructor(host, { backends, absent, original }) {
     this.host = host;
     this.backends = backends;
+    /** What the policy agreed with when it was exported, in words; null where it was compared with nothing. */
+    this.original = original;
     const head = (...names) => h("thead", {}, h("tr", {}, names.map((name) => h("th", { scope: "col" }, name))));
     const table = (caption, columns, body, extra = "") => {
       return h(
@@ -26,8 +29,8 @@ export class Verdict {
     $("check-body").append(
       h("p", { class: "soft" }, `Measured in ${visitor()}.`),
       table(
-        "By backend",
-        ["Backend", "Verdict", "Worst |Δ|", "Median", "95 % below", "Computes on"],
+        "By engine",
+        ["Engine", "Verdict", "Worst |Δ|", "Median", "95 % below", "Computes on"],
         this.#rows,
       ),
       h("div", { class: "actions" }, this.#button),
@@ -35,11 +38,11 @@ export class Verdict {
         "details",
         {},
         h("summary", {}, "Output by output"),
-        table("Worst difference of each output", ["Output", "Backend", "Worst |Δ|", "Allowed", "At the input"], this.#outputs),
+        table("Worst difference of each output", ["Output", "Engine", "Worst |Δ|", "Allowed", "At the input"], this.#outputs),
       ),
       h("p", { class: "soft", id: "check-how" }),
-      ...backends.filter(({ large }) => large).map(({ name }) => h("p", { class: "soft" }, `${name} weighs megabytes and is checked once it is chosen above.`)),
-      ...absent.map(({ name, why }) => h("p", { class: "soft" }, `${name} is left out: ${why}.`)),
+      ...backends.filter(({ large }) => large).map(({ name }) => h("p", { class: "soft" }, `${engine(name)} weighs megabytes and is checked once it is chosen above.`)),
+      ...absent.map(({ name, why }) => h("p", { class: "soft" }, `${engine(name)} is left out: ${why}.`)),
     );
   }
 
@@ -56,7 +59,7 @@ export class Verdict {
       this.#golden.memory = this.host.policy()?.contract.memory ?? null;
       this.#explain();
       for (const backend of order) {
-        this.#say(`Checking ${backend} …`);
+        this.#say(`Checking on ${engine(backend)} …`);
         this.#add(await check(this.host, backend, this.#golden));
       }
       this.#conclude();
@@ -68,7 +71,7 @@ export class Verdict {
   }
 
   #say(words, kind = "") {
-    $("verdict").className = `lead ${kind}`;
+    $("verdict").className = kind;
     $("verdict").textContent = words;
   }
 
@@ -78,7 +81,8 @@ export class Verdict {
     const drawn = left.length ? ` Drawn by chance inside the model, and so not compared: ${left.join(", ")}.` : "";
     $("check-how").textContent =
       `${cases.length} sets of inputs, ${rows} decisions, drawn from what the policy knows of its inputs. Every number must ` +
-      `agree with export-model's own reference by ${RULE}, every choice exactly. Times are of one decision for one agent: ` +
+      `agree with export-model's own reference by ${RULE}, every choice exactly. ` +
+      `${this.original === null ? "" : `That reference agreed with ${this.original} when the policy was exported. `}Times are of one decision for one agent: ` +
       `inputs given, model run, answer read back.${drawn}`;
   }
 
@@ -95,7 +99,7 @@ export class Verdict {
       h(
         "tr",
         { "data-backend": backend, "data-state": state },
-        h("th", { scope: "row" }, backend),
+        h("th", { scope: "row" }, engine(backend)),
         h("td", { class: mark }, `${{ ok: "✓", fail: "✗", warn: "–" }[mark]} ${state}`),
         cells === null ? h("td", { colspan: 4, class: "wide" }, error) : cells.map((cell, i) => h("td", { class: i < 3 ? "number" : "wide" }, cell)),
       ),
@@ -108,7 +112,7 @@ export class Verdict {
           "tr",
           {},
           h("th", { scope: "row" }, output.name),
-          h("td", {}, backend),
+          h("td", {}, engine(backend)),
           h("td", { class: output.passed ? "number" : "number fail" }, text(output.worst)),
           h("td", { class: "wide" }, allowed),
           h("td", { class: "wide" }, output.case ?? ""),
@@ -122,17 +126,13 @@ export class Verdict {
     const wrong = ran.filter(({ passed }) => !passed);
     const idle = this.#results.length - ran.length;
     const note = idle === 0 ? "" : ` ${idle} of ${this.#results.length} did not run (see the table).`;
-    if (ran.length === 0) return this.#say(`Not checked: no backend ran here.${note}`, "fail");
+    if (ran.length === 0) return this.#say(`Not checked: no engine ran here.${note}`, "fail");
     if (wrong.length > 0) {
-      const said = wrong.map(({ backend, worst }) => `${backend} is off by ${text(worst.worst)} at ${worst.name}`);
-      return this.#say(`No: ${said.join(", ")}.${note}`, "fail");
+      const said = wrong.map(({ backend, worst }) => `${engine(backend)} is off by ${text(worst.worst)} at ${worst.name}`);
+      return this.#say(`✗ Other answers: ${said.join(", ")}.${note}`, "fail");
     }
     const worst = Math.max(...ran.flatMap(({ outputs }) => outputs.map((output) => output.worst)));
-    const names = ran.map(({ backend }) => backend).join(", ");
-    const numbers = ran[0].numbers.toLocaleString("en");
-    return this.#say(
-      `Yes. In your browser, ${names} ${ran.length === 1 ? "gives" : "give"} the reference's ${numbers} numbers; the worst difference is ${text(worst)}.${note}`,
-      "ok",
-    );
+    const engines = ran.length === 1 ? "" : ` on ${ran.length} engines`;
+    return this.#say(`✓ Same answers as ${this.original ?? "export-model"}, worst ${text(worst)}, checked in your browser${engines}.${note}`, "ok");
   }
 }

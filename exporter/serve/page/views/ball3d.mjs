@@ -32,9 +32,10 @@ const view = {
   actions: ({ model }) => model,
   // A ball that lasted 20 s went well.
   score: { good: "balls kept up for 20 s", bad: "balls lost" },
+  count: (tally) => `lost ${tally.bad}`,
   status(env, tally) {
     const longest = Math.max(...env.age) * TIME_STEP;
-    return `${AGENTS} balls · longest ${longest.toFixed(1)} s of 20 s · lost ${tally.bad} · kept to the end ${tally.good}`;
+    return `${AGENTS} balls · longest ${longest.toFixed(1)} s of 20 s · kept to the end ${tally.good}`;
   },
   describe(env, tally, chosen) {
     const [x, z] = env.position[chosen];

@@ -33,11 +33,12 @@ const view = {
   observed: (observation) => observation,
   actions: ({ model }) => model,
   score: { good: "walks of 20 s", bad: "falls" },
+  count: (tally, env) => `${Math.max(...metres(env), 0).toFixed(0)} m, falls ${tally.bad}`,
   status(env, tally) {
     const farthest = Math.max(...metres(env), 0);
     const seconds = Math.max(...env.age) * TIME_STEP;
     const speed = seconds > 0 ? farthest / seconds : 0;
-    return `farthest ${farthest.toFixed(1)} m · ${speed.toFixed(1)} m/s · falls ${tally.bad} · walks of 20 s: ${tally.good}`;
+    return `farthest ${farthest.toFixed(1)} m · ${speed.toFixed(1)} m/s · walks of 20 s: ${tally.good}`;
   },
   describe(env, tally, chosen) {
     return (

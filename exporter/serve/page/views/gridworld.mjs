@@ -21,7 +21,8 @@ const view = {
   observed: (observation) => observation,
   actions: ({ model }) => model,
   score: { good: "goals reached", bad: "episodes without a goal" },
-  status: (env, tally) => `goals reached ${tally.good} · failed ${tally.bad}`,
+  count: (tally) => `failed ${tally.bad}`,
+  status: (env, tally) => `goals reached ${tally.good}`,
   describe(env, tally, chosen) {
     const cell = ([column, row]) => `column ${column + 1}, row ${row + 1}`;
     return (

@@ -25,7 +25,8 @@ const view = {
   observed: (observation) => observation,
   actions: ({ model }) => model,
   score: { good: "right doors", bad: "wrong doors, or none" },
-  status: (env, tally) => `correct ${tally.good} · wrong or timed out ${tally.bad}`,
+  count: (tally) => `wrong or timed out ${tally.bad}`,
+  status: (env, tally) => `correct ${tally.good}`,
   describe(env, tally, chosen) {
     const side = env.door[chosen] === LEFT ? "left" : "right";
     return (

@@ -8,8 +8,9 @@ const OBSERVATIONS = ["own racket y", "ball's distance", "ball y", "ball's appro
 /** @param {{side: "left" | "right", opponent: string | null}} site which brain the page's policy is */
 export function viewOf({ side, opponent }) {
   const other = side === "left" ? "right" : "left";
+  const failed = (tally) => tally.missed[side === "left" ? 0 : 1];
   const players = opponent === null ? ["model"] : ["model", "opponent"];
-  const against = opponent ?? "a player that follows the ball (the other brain's bundle lies not beside this one)";
+  const against = opponent ?? "a player that follows the ball (the other brain's bundle is not next to this one)";
   return {
     name: "Tennis",
     story: `The policy plays on the ${side}, against ${against}. A point ends when one of them misses.`,
@@ -27,6 +28,8 @@ export function viewOf({ side, opponent }) {
       return { discrete: left.discrete, continuous: right.continuous };
     },
     score: { good: "points of 50 s", bad: "points that ended in a miss" },
+    failed,
+    count: (tally) => `missed ${failed(tally)}`,
     status(env, tally) {
       return `rally ${env.rally[0]} · best ${tally.best} · missed: left ${tally.missed[0]}, right ${tally.missed[1]}`;
     },
