@@ -60,6 +60,8 @@ class Language(ABC):
 
     #: Function of float32 → how it is written; ``{0}`` and ``{1}`` are the operands.
     functions: Mapping[str, str] = {}
+    #: Products that are added in one statement, in their order: more where a compiler keeps sums in memory between two.
+    terms = 1
 
     def __init__(self, own: bool = False) -> None:
         self.helpers: dict[str, str] = {}

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter as Count
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -21,6 +21,8 @@ from converters.graph.program import Place, Program, Stage, children, every, inl
 from converters.graph.types import BOOL, FLOAT32, INT32
 
 _LANES = 8
+#: A counter, and a number that is added to it.
+_SUM = re.compile(r"(\w+) \+ (\d+)")
 #: What is kept by a reduction is called so.
 _KEPT = {"sum": "sum", "product": "product", "max": "largest", "min": "smallest"}
 _COUNTERS = "ijklmnpqrstuvw"
@@ -136,40 +138,82 @@ class Printer:
 
     def _block(self, stage: Stage, summed: Reduced, base: str, count: int) -> None:
         """So many elements of the last axis, from ``base`` on."""
-        counter, shared = stage.counters[-1], _count_reads(summed)
+        counter = stage.counters[-1]
         indices = [_plus(base, i) for i in range(count)]
         self._counters[id(counter)] = base
         names = [self._locals.fresh(f"{_KEPT[summed.kind]}{i}") for i in range(count)]
         start = self._start(summed)
         rest = "".join(f", {name} = {start}" for name in names[1:])
         self._say(self.language.declaration(summed.dtype, names[0], f"{start}{rest}", constant=False))
-        for each in summed.counters:
+        outer, last = summed.counters[:-1], summed.counters[-1]
+        for each in outer:
             self._open(each, 0, each.length)
-        words: dict[int, str] = {}
-        for x in _common(summed.body, counter):
-            name = self._locals.fresh("x")
-            text = bare(self._text(x, words, shared))
-            self._say(self.language.declaration(x.dtype, name, text, constant=True))
-            words[id(x)] = name
-        rows = [dict(words) for _ in indices]
-        for x in every(summed.body):
-            if isinstance(x, Element) and _only_last(x, counter):
-                for row, text in zip(rows, self._neighbours(x, count, words, shared), strict=True):
-                    row[id(x)] = text
-        for name, index, row in zip(names, indices, rows, strict=True):
-            self._counters[id(counter)] = index
-            self._keep_one(summed, name, self._text(summed.body, row, shared))
-        for _ in summed.counters:
+        terms = self.language.terms if summed.kind == "sum" else 1
+        whole = last.length // terms * terms
+        if whole:
+            self._open(last, 0, whole, terms)
+            self._terms(summed, counter, dict(zip(names, indices, strict=True)), terms)
+            self._close()
+        if whole < last.length:
+            self._counters[id(last)] = str(whole)
+            self._say("{")
+            self._depth += 1
+            self._terms(summed, counter, dict(zip(names, indices, strict=True)), last.length - whole)
+            self._close()
+        for _ in outer:
             self._close()
         self._counters[id(counter)] = base
         for name, text in zip(names, self._neighbours(Element(stage.result, stage.at), count, {}, {}), strict=True):
             self._say(f"{text} = {name};")
 
-    def _neighbours(self, x: Element, count: int, words: dict[int, str], shared: dict[int, int]) -> list[str]:
-        """An element and those after it, by an index that is computed once."""
-        text = self._place(x.tensor, x.at, words, shared)
+    def _terms(self, summed: Reduced, counter: Counter, lanes: Mapping[str, str], count: int) -> None:
+        """Keep so many elements of a reduction's last axis, for each lane (what keeps it, and its index), in order."""
+        last, shared = summed.counters[-1], _count_reads(summed)
+        base, rows = self._counters[id(last)], dict[str, list[str]]()
+        first: dict[int, str] = {}
+        for term in range(count):
+            self._counters[id(last)] = _plus(base, term)
+            self._counters[id(counter)] = next(iter(lanes.values()))
+            words: dict[int, str] = {}
+            for x in _common(summed.body, counter):
+                name = self._locals.fresh("x")
+                text = (
+                    self._element_after(x, last, term, first, shared) if isinstance(x, Element) and count > 1 else None
+                )
+                text = bare(self._text(x, words, shared)) if text is None else text
+                self._say(self.language.declaration(x.dtype, name, text, constant=True))
+                words[id(x)] = name
+            each = [dict(words) for _ in lanes]
+            for x in every(summed.body):
+                if isinstance(x, Element) and _only_last(x, counter):
+                    moved = self._element_after(x, last, term, first, shared) if count > 1 else None
+                    for row, text in zip(each, self._neighbours(x, len(lanes), words, shared, moved), strict=True):
+                        row[id(x)] = text
+            for (name, index), row in zip(lanes.items(), each, strict=True):
+                self._counters[id(counter)] = index
+                rows.setdefault(name, []).append(self._text(summed.body, row, shared))
+        for name, values in rows.items():
+            self._keep_all(summed, name, values)
+
+    def _element_after(
+        self, x: Element, last: Counter, term: int, first: dict[int, str], shared: dict[int, int]
+    ) -> str | None:
+        """An element that many numbers of a counter on from the ``first``; None if they are not equally far apart."""
+        distance = _distance(x, last)
+        if distance is None:
+            return None
+        if term == 0:
+            (first[id(x)],) = self._neighbours(x, 1, {}, shared)
+        tensor, _, index = first[id(x)].removesuffix("]").partition("[")
+        return f"{tensor}[{_plus(index, distance * term)}]"
+
+    def _neighbours(
+        self, x: Element, count: int, words: dict[int, str], shared: dict[int, int], text: str | None = None
+    ) -> list[str]:
+        """An element, ``text`` if that is known, and those after it, by an index that is computed once."""
+        text = self._place(x.tensor, x.at, words, shared) if text is None else text
         tensor, _, index = text.removesuffix("]").partition("[")
-        if " " in index:
+        if not index.isidentifier() and " " in index and _SUM.fullmatch(index) is None:
             at = self._locals.fresh("at")
             self._say(self.language.declaration(INT32, at, index, constant=True))
             index = at
@@ -264,12 +308,18 @@ class Printer:
 
     def _keep_one(self, x: Reduced, name: str, value: str) -> None:
         """Add a value to what is kept, or keep the larger or smaller one."""
+        self._keep_all(x, name, [value])
+
+    def _keep_all(self, x: Reduced, name: str, values: Sequence[str]) -> None:
+        """Add values to what is kept, one after the other, or keep the largest or smallest."""
         function = {"sum": "add", "product": "mul"}.get(x.kind, x.kind)
         if x.body.dtype == BOOL:
             function = {"max": "or", "min": "and"}[x.kind]
-        text = self.language.applied(Applied(function, (x.body, x.body), x.body.dtype), [name, value])
-        if bare(text) == f"{name} + {value}":
-            self._say(f"{name} += {bare(value)};")
+        text = name
+        for value in values:
+            text = self.language.applied(Applied(function, (x.body, x.body), x.body.dtype), [text, value])
+        if bare(text) == f"{name} + {values[0]}":
+            self._say(f"{name} += {bare(values[0])};")
         else:
             self._say(f"{name} = {bare(text)};")
 
@@ -328,10 +378,24 @@ def _only_last(x: Element, counter: Counter) -> bool:
     return bool(x.at) and x.at[-1] is counter and not any(e is counter for i in x.at[:-1] for e in every(i))
 
 
+def _distance(x: Element, counter: Counter) -> int | None:
+    """How far apart the elements for two numbers of a counter lie, one after the other; None if that varies."""
+    stride, distance = 1, 0
+    for length, one in reversed(list(zip(x.tensor.shape, x.at, strict=True))):
+        if one is counter:
+            distance += stride
+        elif any(e is counter for e in every(one)):
+            return None
+        stride *= length
+    return distance
+
+
 def _plus(index: str, count: int) -> str:
     """An index that far on."""
     if index.isdecimal():
         return str(int(index) + count)
+    if found := _SUM.fullmatch(index):
+        return _plus(found[1], int(found[2]) + count)
     return f"{index} + {count}" if count else index
 
 

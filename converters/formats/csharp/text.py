@@ -79,6 +79,8 @@ struct Word
 class CSharp(Language):
     """C# 7.3."""
 
+    terms = 8
+
     def literal(self, value: float, dtype: np.dtype) -> str:
         """A number as C# reads it, to the last bit."""
         if dtype == BOOL:

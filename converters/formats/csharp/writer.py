@@ -83,7 +83,9 @@ def _text(file: str, plan: Plan) -> str:
         (printer.name(s.result.place), CS_TYPES[s.result.dtype.name], s.result.place.size) for s in program.stages
     ]
     fields = [(printer.name(p), CS_TYPES[p.dtype.name]) for p in printer.inputs(program)]
+    arrays = [(printer.name(p), CS_TYPES[p.dtype.name]) for p in program.constants]
     body = [f"        {kind}[] {n} = this.{n};" for n, kind in (*fields, *(p[:2] for p in places))]
+    body += [f"        {kind}[] {n} = {name}.{n};" for n, kind in arrays]  # a virtual machine looks up each static
     body += statements
     if plan.weights.file is not None:
         wrong = 'throw new global::System.InvalidOperationException("load the weights first");'
@@ -125,11 +127,11 @@ def _text(file: str, plan: Plan) -> str:
         *([_UNIFORM] if draws else []),
         *([_NORMAL.replace("$X", printer.function(box_muller, "radius", "turn"))] if header.noise else []),
     ]
-    weights = _weights(file, plan, words, printer)
+    constants = _weights(file, plan, words, printer)
     inner = [*(m.rstrip("\n") for m in members), *methods]
     if words.helpers:
         inner += ["\n".join(f"    {line}" for line in h.splitlines()) for h in words.helpers.values()]
-    inner += ["\n".join(f"    {line}" for line in w.splitlines()) for w in weights]
+    inner += ["\n".join(f"    {line}" for line in c.splitlines()) for c in constants]
     return (
         f"/* {name}: a policy without a runtime, C# 7.3 for .NET Standard 2.0: every Unity since 2018, Godot .NET.\n"
         f"   Made by export-model.\n\n{plan.contract}\n\nnamespace Policies\n{{\n\n"
