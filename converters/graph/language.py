@@ -121,7 +121,7 @@ class Language(ABC):
         if function not in self.functions:
             return self.helper(function, operands, x.dtype)
         if x.dtype == FLOAT32:
-            return self.round_to(self.functions[function].format(*operands), x)
+            return self.round_to(self.functions[function].format(*map(bare, operands)), x)
         wide = [self.cast(o, x.dtype, np.dtype(np.float32)) for o in operands]  # whole numbers are whole
         return self.cast(self.functions[function].format(*wide), np.dtype(np.float32), x.dtype)
 

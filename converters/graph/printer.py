@@ -49,7 +49,7 @@ class Printer:
     def name(self, place: Place) -> str:
         """What a place is called in the text."""
         if id(place) not in self._names:
-            word = identifier(place.name)[:60]
+            word = identifier(place.name.removesuffix("/read"))[:60]  # TensorFlow's name of a variable's value
             wish = {"constant": f"{self._weight}{word}", "computed": f"t_{word}", "input": word}[place.kind]
             self.called(place, self._scope.fresh(wish))
         return self._names[id(place)]

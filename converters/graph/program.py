@@ -166,10 +166,11 @@ class _Builder:
         place = Place("computed", self.node.name, dtype, int(np.prod(shape, dtype=np.int64)))
         result = Tensor(place, dtype, tuple(int(n) for n in shape))
         origin = self.node.origin
-        source = "" if origin is None else f", {origin if isinstance(origin, str) else ' '.join(origin)}"
-        self.stages.append(
-            Stage(result, counters, at, inline_scalars(element(at)), f"{self.node.op} {self.node.name}{source}")
-        )
+        op = self.node.op.removeprefix("_Fused")
+        words = {origin} if isinstance(origin, str) else {*(origin or ())}
+        source = "".join(f" ({w})" for w in sorted(words - {self.node.name, f"{self.node.name}:0"}))
+        about = f"{op} {self.node.name}{source}"
+        self.stages.append(Stage(result, counters, at, inline_scalars(element(at)), about))
         return result
 
     def reduce(
@@ -275,7 +276,7 @@ def _join_once(program: Program) -> bool:
         for e in elements(stage.body):
             reads.setdefault(e.tensor.place, []).append(e)
         swap: dict[int, Expression] = {}
-        reducing = False
+        reducing, abouts = False, list[str]()
         for place, found in reads.items():
             before = made.get(place)
             if before is None or readers[place] > 1 or place in kept_places:
@@ -290,7 +291,9 @@ def _join_once(program: Program) -> bool:
             body = inline_scalars(before.body, turned)
             swap |= {id(e): body for e in found}
             gone.add(place)
+            abouts.append(before.about)
         if swap:
+            stage.about = ", ".join([*abouts, stage.about])
             stage.body = inline_scalars(stage.body, swap)
     program.stages = [s for s in program.stages if s.result.place not in gone]
     return bool(gone)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from converters.formats.programs.members import header_of
 from exporter.snippets.contract import (
     STEPS,
     Bundle,
@@ -153,3 +154,57 @@ def _read(spec: TensorSpec, variable: str) -> str:
     return (
         f"using var {variable} = (worker.PeekOutput({string_literal(spec.name)}) as Tensor<{kind}>).ReadbackAndClone();"
     )
+
+
+# ------------------------------------------------------------------ source code
+
+
+def source_agent(bundle: Bundle) -> str:
+    """Return an ML-Agents Agent whose Heuristic is the policy's C# class: no Model, no package but ML-Agents."""
+    signature = bundle.signature
+    header = header_of(bundle.name, signature)
+    filled, vectors = list[str](), 0
+    for f in header.inputs:
+        vectors += f.spec.role is Role.VECTOR
+        if f.spec.role is Role.VECTOR and vectors == 1:
+            filled.append(f"GetObservations().CopyTo(policy.{f.name}, 0);")
+        elif f.spec.role is Role.MASKS:
+            value = "true" if f.spec.dtype == "bool" else "1"
+            filled.append("// false or 0 where an action is forbidden")
+            filled.append(f"for (int i = 0; i < policy.{f.name}.Length; i++) policy.{f.name}[i] = {value};")
+        elif f.spec.role is not Role.PREV_ACTION:
+            filled.append(f"// fill policy.{f.name}: {', '.join(meaning(bundle, f.spec))}")
+    members = {f.spec.name: f.name for f in header.outputs}
+    given = list[str]()
+    for head in bundle.heads:
+        name = members[head.name]
+        if head.role is Role.LOG_PROBS:
+            given += ["policy.Choose(classes);", *_discrete("classes")]
+        elif head.is_continuous:
+            given += [
+                "var continuous = actionsOut.ContinuousActions;",
+                f"for (int i = 0; i < continuous.Length; i++) continuous[i] = policy.{name}[i];",
+            ]
+        else:
+            given += _discrete(f"policy.{members[bundle.plain(head).name]}")
+    previous = next((f for f in header.inputs if f.spec.role is Role.PREV_ACTION), None)
+    if previous is not None:
+        one = f"policy.{previous.name}"
+        given.append(f"for (int i = 0; i < {one}.Length; i++) {one}[i] = discrete[i];")
+    classes = len(signature.branches)
+    return fill_template(
+        "source_agent.cs",
+        file=f"{bundle.name}.cs",
+        type=f"{header.class_name}Agent",
+        policy=header.class_name,
+        classes=f"    readonly int[] classes = new int[{classes}];\n" if "policy.Choose(classes);" in given else "",
+        filled="".join(f"        {line}\n" for line in filled),
+        given="".join(f"        {line}\n" for line in given),
+    )
+
+
+def _discrete(source: str) -> list[str]:
+    return [
+        "var discrete = actionsOut.DiscreteActions;",
+        f"for (int i = 0; i < discrete.Length; i++) discrete[i] = (int){source}[i];",
+    ]

@@ -8,7 +8,7 @@ from string import Template
 from typing import Any
 
 from converters.formats.format import Code, Format
-from converters.formats.registry import BARRACUDA, FROZEN_GRAPH, ONNX, SAVED_MODEL, TFJS, WRITTEN
+from converters.formats.registry import BARRACUDA, CSHARP, FROZEN_GRAPH, ONNX, SAVED_MODEL, TFJS, WRITTEN
 from exporter.snippets import agent, csharp, godot, javascript, python, serving, unity
 from exporter.snippets.contract import Bundle, string_literal
 from signatures.errors import BundleError, UsageError
@@ -57,6 +57,7 @@ TARGETS: tuple[Target, ...] = (
     Target("inference-engine", "Unity Inference Engine (Sentis), C#", "csharp", (ONNX,), csharp.inference_engine),
     Target("godot", "Godot RL Agents, an AIController, GDScript", "gdscript", (ONNX,), godot.godot),
     Target("agent", "Unity, an ML-Agents Agent, C#", "csharp", (ONNX, BARRACUDA), agent.agent),
+    Target("source-agent", "Unity without a runtime, an Agent's Heuristic", "csharp", (CSHARP,), csharp.source_agent),
 )
 
 

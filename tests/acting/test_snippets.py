@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from converters.formats.registry import DEFAULTS
 from converters.runtimes.javascript.node import js_home, node_executable
 from exporter import export_model, load_policy
 from exporter.acting.policy import LoadedPolicy
@@ -45,10 +46,11 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("snippets")
     for kind in KINDS:
         labels = {"actions": ["roll </script>", "pitch"]} if kind == "continuous" else None
-        list(export([fixture(kind)], ExportOptions(folder, verify="none", labels=labels)))
+        options = ExportOptions(folder, (*DEFAULTS, "csharp"), verify="none", labels=labels)
+        list(export([fixture(kind)], options))
     renamed = folder / "own-names.bytes"
     shutil.copy(fixture("twobrains"), renamed)
-    export_model(renamed, folder, names="source", verify="none")
+    export_model(renamed, folder, to=(*DEFAULTS, "csharp"), names="source", verify="none")
     return folder
 
 
@@ -425,7 +427,8 @@ def test_every_kind_of_public_policy_has_snippets(kind: str, tmp_path: Path) -> 
     rendered = 0
     for number, file in enumerate(files[:: max(1, len(files) // 12)]):
         try:
-            results = list(export([file], ExportOptions(tmp_path / str(number), verify="none")))
+            to = (*DEFAULTS, "csharp")
+            results = list(export([file], ExportOptions(tmp_path / str(number), to, verify="none")))
         except ExportModelError:
             continue
         for result in results:

@@ -107,7 +107,7 @@ class C(Language):
         if function == "within":
             takes, operands = f"{takes}, int *outside", [*operands, "&outside"]
         self.helpers[name] = f"static {kind} {name}({takes}) {{ return {_HELPERS[function][kind != 'float']}; }}"
-        return f"{name}({', '.join(operands)})"
+        return f"{name}({', '.join(map(bare, operands))})"
 
     def own_name(self, function: str) -> str:
         """As the C library's, behind the prefix."""
