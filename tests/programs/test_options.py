@@ -12,6 +12,7 @@ import pytest
 
 from converters.compiler.passes.weights import Storage, round_weights
 from converters.formats.format import Format, WriteOptions
+from converters.formats.programs.artifact import can_confine, vetted
 from converters.formats.programs.members import answers, header_of
 from converters.formats.programs.weights import weights_name
 from converters.formats.registry import WRITTEN
@@ -20,12 +21,13 @@ from converters.runtimes.c import compiler
 from converters.runtimes.csharp import tools
 from converters.runtimes.javascript.node import node_executable
 from converters.runtimes.pool import RuntimePool
+from exporter.api import verify_bundle
 from exporter.export.pipeline import Exporter, ExportOptions, export
 from exporter.export.sources import read_source
 from exporter.reports.summary import failure_lines
 from fixtures import FIXTURES, path
 from signatures.code import CodeOptions, code_options
-from signatures.errors import UsageError
+from signatures.errors import DamagedFileError, UsageError
 from tests.programs.mains import MAINS
 from tests.programs.test_programs import PROGRAMS, need
 
@@ -82,6 +84,11 @@ def test_policies_agree(name: str, weights: Storage, form: Format, tmp_path: Pat
     assert compared >= everything > set(answers(result.policy.signature))
     assert result.contract["tool"]["code"] == {"math": "own", "weights": "file", "outputs": "all"}
     assert weights_name(name) in json.loads((result.folder / "policy.json").read_text())["files"]
+    if not can_confine():
+        return
+    again = verify_bundle(result.folder, runtimes=runtime)
+    assert again.passed is True, "\n".join(failure_lines(again))
+    assert {c.output for c in again.comparisons if c.runtime == runtime} >= everything
 
 
 @each_program
@@ -258,6 +265,18 @@ def test_unusual_observations_are_counted(form: Format, tmp_path: Path) -> None:
         *("0", "0", "2", "1"),
         *("2", "2"),
     ]
+
+
+def test_verify_misses_the_file_of_weights(tmp_path: Path) -> None:
+    """A candidate without it is damaged, and named."""
+    options = ExportOptions(tmp_path, ("c",), verify="none", code=CodeOptions(weights="file"))
+    (result,) = export([path("continuous")], options)
+    (result.folder / weights_name("continuous")).unlink()
+    if not can_confine():
+        pytest.skip("nothing confines a program on this system")
+    (tmp_path / "copy").mkdir()
+    with pytest.raises(DamagedFileError, match=r"continuous\.weights\.bin is missing"):
+        vetted(result.folder / "continuous.h", [], tmp_path / "copy")
 
 
 def test_a_guard_needs_a_normaliser(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from converters.files.children.confinement import in_force
 from converters.files.fetch import read_bytes
 from converters.formats.format import Port, Ports
 from converters.formats.programs.members import answers
+from converters.formats.programs.weights import weights_name
 from signatures.code import CodeOptions
 from signatures.contract import EMBEDDED, Contract, parse
 from signatures.errors import DamagedFileError, UnsupportedOpError
@@ -61,6 +62,13 @@ def vetted(path: Path, names: Sequence[str], folder: Path) -> Path:
             fix="verify it on Linux 5.13 or later, or export the policy again, which verifies it",
         )
     ports(path)
+    if CodeOptions.of(contract_held(path).tool).weights == "file":
+        weights = path.with_name(weights_name(path.stem))
+        if not weights.is_file():
+            raise DamagedFileError(
+                f"{weights.name} is missing", why=f"{path.name} loads it", fix="keep both in one folder"
+            )
+        shutil.copyfile(weights, folder / weights.name)
     return Path(shutil.copyfile(path, folder / path.name))
 
 
