@@ -36,7 +36,7 @@ from tests.targets.dressed import Pair
 BATCHES = (1, 3, 16)
 _SUFFIXES = (".bytes", ".pb", ".nn", ".onnx", ".pt", ".keras")
 #: What the weights of a .pt do not tell.
-_SENSORS = {"mla_ppo_vis_fully_connected.pt": ((1, 12, 12),)}
+SENSORS = {"mla_ppo_vis_fully_connected.pt": ((1, 12, 12),)}
 
 
 @dataclass
@@ -166,7 +166,7 @@ def swept(files: Sequence[Path], pool: RuntimePool | None = None, names: Collect
 def _read(files: Sequence[Path], unread: Counter[str]) -> Iterator[tuple[Path, list[Policy]]]:
     for path in files:
         try:
-            options = ReadOptions(sensors=_SENSORS.get(path.name, ()), trust_source=path.suffix == ".keras")
+            options = ReadOptions(sensors=SENSORS.get(path.name, ()), trust_source=path.suffix == ".keras")
             yield path, read_source(path, options).policies()
         except ExportModelError as error:
             unread[re.sub(r"'[^']*'", "…", error.what)] += 1

@@ -1,11 +1,14 @@
-"""Emitted files that ML-Agents' players threw at, or played otherwise (../shared/unity/r3): none has that form now.
+"""Emitted files that ML-Agents' players were given (../shared/unity/r3): what is written of the same sources now.
 
-The forms are read off the files themselves: onnx's own parser for ``.onnx``, and the layers of a ``.nn``.
+Every row of the record is asked: the model of that player plays the file of today, and its numbers are the policy's; or
+it is refused by name, and only where a player threw, differed or was given nothing. The forms that players threw at are
+read off the files themselves: onnx's own parser for ``.onnx``, and the layers of a ``.nn``.
 """
 
 from __future__ import annotations
 
 import json
+from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,11 +16,21 @@ from typing import Any
 import onnx
 import pytest
 
+from converters.consumers.profiles import profile
+from converters.consumers.unity.checker import check_file
+from converters.consumers.unity.consumers import CONSUMERS, EARLIER
+from converters.consumers.unity.settings import Brain
 from converters.formats.barracuda.format import NnModel, parse
 from converters.formats.barracuda.vocabulary import LayerType
+from converters.formats.source import ReadOptions
 from exporter import export_model
-from signatures.errors import ProfileError, UnsupportedOpError
+from exporter.export.sources import read_source
+from signatures.errors import ProfileError, SignatureError, UnsupportedOpError
+from tests.barracuda.accepted import agent_of
+from tests.barracuda.test_writer import assert_answers
 from tests.known import ABSENT, SHARED
+from tests.targets.dressed import Pair, Plain
+from tests.targets.sweep import SENSORS
 
 pytestmark = [pytest.mark.corpus, pytest.mark.slow]
 
@@ -38,6 +51,66 @@ def original(source: str) -> Path:
         return next(p for end in ("frozen_graph_def.pb", "*.bytes") for p in sorted(folder.glob(end)))
     stem, _, ending = name.rpartition("-")
     return SHARED / room / f"{stem}.{ending}"
+
+
+#: Runtime → the release that was played in it.
+PLAYERS = {c.runtime: c for c in (*EARLIER.values(), *CONSUMERS.values())}
+BATCHES = (1, 3, 16)
+
+
+def cells() -> dict[str, dict[tuple[str, str], list[dict[str, Any]]]]:
+    """Source → (profile, form) → its rows."""
+    found: dict[str, dict[tuple[str, str], list[dict[str, Any]]]] = defaultdict(lambda: defaultdict(list))
+    for row in rows():
+        found[row["source"]][row["profile"], row["form"]].append(row)
+    return found
+
+
+CELLS = cells()
+
+
+def was_right(row: dict[str, Any]) -> bool:
+    """Whether a file was written, accepted, played without an exception, and equal where it was compared."""
+    threw = isinstance(row.get("played"), list) or row.get("run", "ok") != "ok"
+    return "refused_by_tool" not in row and not threw and False not in (row.get("accepted"), row.get("equal"))
+
+
+@pytest.mark.parametrize("source", sorted(CELLS) or ["shared-is-absent"])
+def test_what_was_played_is_played_or_refused_by_name(source: str, tmp_path: Path) -> None:
+    if source not in CELLS:
+        pytest.skip(ABSENT)
+    path, brain = original(source), source.partition("#")[2]
+    sensors = SENSORS.get(path.name, ())
+    models = read_source(path, ReadOptions(sensors=sensors)).compile_models()
+    plain = {policy.name: Plain(policy) for _, policy in models if policy.name.endswith(brain)}
+    for (wanted, form), recorded in CELLS[source].items():
+        folder = tmp_path / wanted / form
+        try:
+            made = export_model(path, folder, for_=wanted, to=form, sensors=sensors, verify="none")
+        except (ProfileError, SignatureError, UnsupportedOpError) as error:
+            assert error.fix, (wanted, form)
+            assert not all(map(was_right, recorded)), (wanted, form, error.what)
+            continue
+        for result in (r for r in made if r.policy.name in plain):
+            (file,) = result.folder.glob(f"*.{form}")
+            agent = same_numbers(plain[result.policy.name], wanted, form, file)
+            for row in (r for r in recorded if r.get("by") == "player"):
+                verdict = check_file(file, PLAYERS[row["runtime"]], agent)
+                assert verdict.refused is None, (wanted, form, verdict.refused)
+                assert all(verdict.plays.values()), (wanted, form, verdict.played)
+                assert verdict.checked.get("stochastic", True), (wanted, form, verdict.to_dict())
+
+
+def same_numbers(plain: Plain, wanted: str, form: str, file: Path) -> Brain:
+    """Fail where the numbers are not the policy's; the agent that it is for."""
+    policy, consumer = plain.policy, profile(wanted)
+    if form in consumer.own_names:
+        assert_answers(policy, parse(file.read_bytes()), BATCHES)
+        return agent_of(policy)
+    pair = Pair.of(policy, consumer, plain, form=form)
+    for seed, count in enumerate(BATCHES):
+        assert pair.difference(count, seed) is None, (wanted, form, count)
+    return pair.brain()
 
 
 def throwing(profile: str, form: str) -> list[Any]:
