@@ -28,6 +28,7 @@ def body(kind: str) -> Any:
 
 
 REFUSED: Mapping[str, tuple[Sequence[Any], Mapping[str, Any], Mapping[str, Array], str]] = {
+    "a copy of nothing": ([node("Identity", [])], X, {}, r"Identity \(node 'y'\): input 0 is missing"),
     "an unknown op": ([node("Det", ["x"])], X, {}, r"Det \(node 'y'\): no entry of the table of ONNX ops"),
     "another domain": (
         [node("Gelu", ["x"], domain="com.microsoft")], X, {}, r"Gelu of com\.microsoft \(node 'y'\): its domain",
@@ -232,13 +233,30 @@ def large_halves(graph: Any) -> None:
     graph.initializer[0].int32_data[:] = [1 << 16] * 8
 
 
-DAMAGE = (large_halves, dangling, twice, no_output, two_inputs, short_data, huge_dims, negative_dims)
+DAMAGE = (
+    large_halves,
+    dangling,
+    twice,
+    no_output,
+    two_inputs,
+    short_data,
+    huge_dims,
+    negative_dims,
+)
 
 
 @pytest.mark.parametrize("change", DAMAGE, ids=lambda change: change.__name__)
 def test_damage_is_called_so(change: Any, tmp_path: Path) -> None:
     with pytest.raises(DamagedFileError):
         read(changed(change), tmp_path)
+
+
+@pytest.mark.parametrize(("inputs", "outputs"), [([], ["copy"]), (["x"], [])])
+def test_a_copy_of_or_into_nothing_that_no_output_needs_is_no_matter(
+    inputs: list[str], outputs: list[str], tmp_path: Path
+) -> None:
+    message = changed(lambda graph: graph.node.append(helper.make_node("Identity", inputs, outputs)))
+    assert [n.op for n in read(message, tmp_path).graph.nodes] == [n.op for n in read(small(), tmp_path).graph.nodes]
 
 
 def test_a_small_file_cannot_ask_for_much_memory(tmp_path: Path) -> None:

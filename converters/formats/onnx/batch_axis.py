@@ -96,7 +96,7 @@ def _without_echoes(
     """Return the inputs and outputs but for those that Identities alone connect, where any others are there."""
     given = {v.name: v.name for v in declared}
     for node in nodes:
-        if node.op_type == "Identity" and node.input[0] in given:
+        if node.op_type == "Identity" and node.output and given.keys() & {*node.input[:1]}:
             given[node.output[0]] = given[node.input[0]]
     judged = [v for v in outputs if v.name not in given]
     read = {given[name] for n in nodes if n.op_type != "Identity" for name in n.input if name in given}
