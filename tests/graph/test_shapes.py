@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from converters.compiler.passes.normalise import normalise
 from converters.graph.nodes import Graph, Node, TensorShape
 from converters.graph.shapes import infer_types
-from converters.graph.types import FLOAT32
+from converters.graph.types import BOOL, FLOAT32
 from exporter.export.sources import read_source
 from fixtures import path as fixture
+from signatures.errors import GraphError
 
 
 def test_a_node_that_reads_something_else_is_inferred_anew() -> None:
@@ -46,3 +48,16 @@ def test_types_of_a_compiled_graph_are_those_of_new_nodes() -> None:
             assert (kind.value is None) == (fresh[name].value is None)
             if kind.value is not None:
                 assert np.array_equal(kind.value, fresh[name].value)
+
+
+@pytest.mark.parametrize("op", ["MatMul", "BiasAdd", "Add", "Maximum", "Less", "AddN", "Select", "SelectV2"])
+def test_operands_of_several_dtypes_are_refused(op: str) -> None:
+    """TensorFlow does not load such a node. As bool, a placeholder of a damaged file went through into five formats."""
+    x, y = (
+        Node(name, "Placeholder", (), {"dtype": dtype, "shape": TensorShape(shape)})
+        for name, dtype, shape in (("x", BOOL, (None, 3)), ("y", FLOAT32, (3,) if op == "BiasAdd" else (3, 3)))
+    )
+    inputs = ("x", "x", "y") if op.startswith("Select") else ("x", "y")
+    with pytest.raises(GraphError) as refused:
+        infer_types(Graph((x, y, Node("z", op, inputs))))
+    assert "they are of bool and float32, and must be of one dtype" in (refused.value.why or "")

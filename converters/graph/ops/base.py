@@ -269,6 +269,7 @@ def broadcast_of(dtype: np.dtype | None = None, *, count: int | None = None) -> 
     def infer(node: Node, args: Sequence[TensorType], symbols: Symbols) -> Sequence[TensorType]:
         if count is not None and len(args) != count:
             raise shape_error(node, args, f"it takes {count} inputs")
+        require_one_dtype(node, args)
         shape: tuple[Dim, ...] | None = ()
         for arg in args:
             try:
@@ -278,6 +279,12 @@ def broadcast_of(dtype: np.dtype | None = None, *, count: int | None = None) -> 
         return [TensorType(dtype or args[0].dtype, shape)]
 
     return infer
+
+
+def require_one_dtype(node: Node, args: Sequence[TensorType]) -> None:
+    """Raise GraphError where inputs are of several dtypes, which TensorFlow does not run."""
+    if len(found := {a.dtype.name: None for a in args}) > 1:
+        raise shape_error(node, args, f"they are of {' and '.join(found)}, and must be of one dtype")
 
 
 def shape_error(node: Node, args: Sequence[TensorType], why: str) -> GraphError:

@@ -25,6 +25,7 @@ from converters.graph.ops.base import (
     emit_squeeze,
     plain,
     require_constant,
+    require_one_dtype,
     same_as,
     shape_error,
     type_attr,
@@ -80,6 +81,7 @@ def _product(a: np.ndarray, b: np.ndarray, wide: Callable[[np.ndarray], np.ndarr
 
 
 def _infer_matmul(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
+    require_one_dtype(node, args[:2])
     a, b = args[0].shape, args[1].shape
     if a is None or b is None:
         return [TensorType(args[0].dtype, (symbols.fresh(), symbols.fresh()) if node.op == "MatMul" else None)]
@@ -117,6 +119,7 @@ def _lower_matmul(node: Node, builder: OnnxBuilder) -> Any:
 def _infer_bias_add(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
     if len(args) != 2:
         raise shape_error(node, args, "it takes 2 inputs")
+    require_one_dtype(node, args)
     x, bias = args[0].shape, args[1].shape
     if x is not None and bias is not None:
         last = x[-1] if x else None

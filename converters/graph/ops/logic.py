@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,7 @@ from converters.graph.ops.base import (
     direct,
     emit_unsqueeze,
     plain,
+    require_one_dtype,
     same_as,
     type_attr,
 )
@@ -28,7 +29,7 @@ from converters.graph.ops.litert.elementwise import select
 from converters.graph.ops.loops import elementwise as loops
 from converters.graph.ops.loops.base import Loops, elementwise, simple
 from converters.graph.ops.older import select_v2
-from converters.graph.types import BOOL, TensorType
+from converters.graph.types import BOOL, Symbols, TensorType
 
 T = type_attr()
 
@@ -71,6 +72,16 @@ def _tfjs_select(builder: GraphBuilder, node: Node, types: Mapping[str, TensorTy
     """TensorFlow.js broadcasts a vector condition over the last axis, not the first: SelectV2 of a reshaped one."""
     condition = barracuda.whole_rows(builder, node, types)
     return Node(node.name, "SelectV2", (condition, *node.inputs[1:]), origin=node.origin)
+
+
+def _infer_select(node: Node, args: Sequence[TensorType], symbols: Symbols) -> Sequence[TensorType]:
+    require_one_dtype(node, args[1:])
+    return [TensorType(args[1].dtype, args[1].shape if args[1].shape is not None else args[2].shape)]
+
+
+def _infer_select_v2(node: Node, args: Sequence[TensorType], symbols: Symbols) -> Sequence[TensorType]:
+    kind = args[1].dtype
+    return broadcast_of()(node, [TensorType(kind, args[0].shape), *args[1:]], symbols)
 
 
 OPS = (
@@ -121,9 +132,7 @@ OPS = (
     ),
     OpDef(  # not elementwise: a condition of rank 1 chooses whole rows
         "Select",
-        lambda node, args, symbols: [
-            TensorType(args[1].dtype, args[1].shape if args[1].shape is not None else args[2].shape)
-        ],
+        _infer_select,
         _select,
         _lower_select,
         (type_attr("T", "in:1"),),
@@ -135,7 +144,7 @@ OPS = (
     ),
     OpDef(  # of no policy's graph, but of a TensorFlow.js model's
         "SelectV2",
-        lambda node, args, symbols: [TensorType(args[1].dtype, broadcast_of()(node, args, symbols)[0].shape)],
+        _infer_select_v2,
         lambda node, c, a, b: np.where(c, a, b),
         attrs=(type_attr("T", "in:1"),),
         barracuda=barracuda.SELECT,
