@@ -33,7 +33,8 @@ EMBEDDED = "export_model_contract"
 #: Characters that may stand in a policy's name.
 _NAME = re.compile(r"[A-Za-z0-9._-]{1,255}")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
-_DTYPES = (
+#: What tensors may be of.
+DTYPES = (
     *("bool", "float16", "float32", "float64", "int8", "int16", "int32", "int64"),
     *("uint8", "uint16", "uint32", "uint64"),
 )
@@ -275,7 +276,7 @@ def _tensor(entry: Field, roles: Any) -> TensorSpec:
     return TensorSpec(
         entry["name"].text(),
         role,
-        entry["dtype"].one_of(_DTYPES),
+        entry["dtype"].one_of(DTYPES),
         shape,
         tuple(s.text() for s in source.items())
         if isinstance(source.value, list)
@@ -368,7 +369,7 @@ def _part(entry: Field) -> SourcePart:
 
 
 def _array(entry: Field) -> np.ndarray:
-    dtype = np.dtype(entry["dtype"].one_of(_DTYPES))
+    dtype = np.dtype(entry["dtype"].one_of(DTYPES))
     try:
         value = np.array(entry["value"].value)
         if value.size > _MOST_FIXED or value.dtype.kind not in "biuf":

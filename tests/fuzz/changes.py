@@ -403,7 +403,9 @@ def bundle(files: Files, random: Random) -> Files:
 
 
 def keras_config(files: Files, random: Random) -> Files:
-    return {"policy.keras": zipped({**files, "config.json": _json(files["config.json"], random)})}
+    stored = {name: data for name, data in files.items() if name != "weights.npz"}
+    stored["config.json"] = _json(files["config.json"], random)
+    return {"policy.keras": zipped(stored), "weights.npz": files["weights.npz"]}
 
 
 #: What the header of an array may say.

@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import json
 import tempfile
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -27,7 +28,7 @@ from tests.checkpoint.writing import policy as training_policy
 from tests.fuzz import changes, robots
 from tests.fuzz.changes import Files
 from tests.handmade import constant, continuous_policy, graph_bytes, graph_def, node, sampled_policy
-from tests.hostile import test_keras_config, zoo
+from tests.hostile import zoo
 
 
 @dataclass(frozen=True)
@@ -172,29 +173,15 @@ def _torchscript() -> list[Files]:
     return _single("policy.pt", [f.read_bytes() for f in sorted((FOLDER / "torchscript").glob("*.pt"))])
 
 
-def _keras() -> list[Files]:
-    layers = [test_keras_config.DENSE, test_keras_config.layer("LSTM", "keras.src.layers.rnn.lstm")]
-    config = json.dumps(test_keras_config.model(*layers)).encode()
-    return [{"config.json": config, "metadata.json": b"{}", "model.weights.h5": b""}]
+#: Name of a weight → its shape.
+Shapes = dict[str, tuple[int, ...]]
 
 
-def _web_layers() -> list[Files]:
-    """TensorFlow.js layers models: a chain, and a model of several inputs."""
+def _layered() -> list[tuple[str, dict[str, Any], Shapes]]:
+    """Models of layers, class, configuration and weights: a chain, one of steps, and one of several inputs."""
 
     def layer(kind: str, **config: Any) -> dict[str, Any]:
         return {"class_name": kind, "config": {"name": kind.lower(), "trainable": True, "dtype": "float32", **config}}
-
-    def weight(name: str, *shape: int) -> dict[str, Any]:
-        return {"name": name, "shape": list(shape), "dtype": "float32"}
-
-    def model(kind: str, config: dict[str, Any], weights: list[dict[str, Any]]) -> Files:
-        count = sum(int(np.prod(w["shape"])) for w in weights)
-        topology = {"keras_version": "tfjs-layers 4.22.0", "backend": "tensor_flow.js", "model_config": None}
-        topology["model_config"] = {"class_name": kind, "config": config}  # type: ignore[assignment]
-        manifest = [{"paths": ["weights.bin"], "weights": weights}]
-        content = {"format": "layers-model", "modelTopology": topology, "weightsManifest": manifest}
-        data = np.linspace(-1, 1, count, dtype=np.float32).tobytes()
-        return {"model.json": json.dumps(content).encode(), "weights.bin": data}
 
     dense = layer("Dense", units=2, activation="tanh", use_bias=True)
     chain = [
@@ -214,15 +201,72 @@ def _web_layers() -> list[Files]:
     nodes = [(given, []), (dense, [["inputlayer", 0, 0, {}]]), (add, [["dense", 0, 0, {}], ["dense", 0, 0, {}]])]
     layers = [{**x, "name": x["config"]["name"], "inbound_nodes": [i] if i else []} for x, i in nodes]
     ends = {"input_layers": [["inputlayer", 0, 0]], "output_layers": [["add", 0, 0]]}
-    kernel = [weight("dense/kernel", 8, 2), weight("dense/bias", 2)]
-    recurrent = [weight("lstm/kernel", 2, 8), weight("lstm/recurrent_kernel", 2, 8), weight("lstm/bias", 8)]
+    bias = {"dense/bias": (2,)}
+    images: Shapes = {"conv2d/kernel": (2, 2, 1, 2), "conv2d/bias": (2,), "dense/kernel": (8, 2), **bias}
+    cell: Shapes = {"lstm/kernel": (2, 8), "lstm/recurrent_kernel": (2, 8), "lstm/bias": (8,)}
     return [
-        model("Sequential", {"name": "s", "layers": chain},
-              [weight("conv2d/kernel", 2, 2, 1, 2), weight("conv2d/bias", 2), *kernel]),
-        model("Sequential", {"name": "s", "layers": steps},
-              [*recurrent, weight("dense/kernel", 2, 2), weight("dense/bias", 2)]),
-        model("Model", {"name": "m", "layers": layers, **ends}, [weight("dense/kernel", 3, 2), kernel[1]]),
-    ]  # fmt: skip
+        ("Sequential", {"name": "s", "layers": chain}, images),
+        ("Sequential", {"name": "s", "layers": steps}, {**cell, "dense/kernel": (2, 2), **bias}),
+        ("Model", {"name": "m", "layers": layers, **ends}, {"dense/kernel": (3, 2), **bias}),
+    ]
+
+
+def _keras() -> list[Files]:
+    """Configurations of both spellings; ``weights.npz`` has what a process would have read of ``model.weights.h5``."""
+    models = [*_layered(), ("Functional", keras_3(), {"dense/kernel": (3, 2), "dense/bias": (2,)})]
+    return [
+        {
+            "config.json": json.dumps({"module": "keras", "class_name": kind, "config": config}).encode(),
+            "metadata.json": b"{}",
+            "model.weights.h5": b"",
+            "weights.npz": groups(shapes),
+        }
+        for kind, config, shapes in models
+    ]
+
+
+def keras_3() -> dict[str, Any]:
+    """A model of one layer as Keras 3 spells it."""
+
+    def layer(kind: str, name: str, calls: list[Any], **config: Any) -> dict[str, Any]:
+        own = {"name": name, "dtype": {"module": "keras", "class_name": "DTypePolicy", "config": {"name": "float32"}}}
+        known = {"module": "keras.layers", "class_name": kind, "registered_name": None, "name": name}
+        return {**known, "config": {**own, **config}, "inbound_nodes": calls}
+
+    seen = {"dtype": "float32", "keras_history": ["seen", 0, 0]}
+    tensor = {"class_name": "__keras_tensor__", "config": {"shape": [None, 3], **seen}}
+    first = layer("InputLayer", "seen", [], batch_shape=[None, 3], sparse=False)
+    dense = layer("Dense", "dense", [{"args": [tensor], "kwargs": {}}], units=2, activation="tanh", use_bias=True)
+    ends = {"input_layers": [["seen", 0, 0]], "output_layers": [["dense", 0, 0]]}
+    return {"name": "functional", "trainable": True, "layers": [first, dense], **ends}
+
+
+def groups(shapes: Shapes) -> bytes:
+    """The weights by the groups of a ``.keras``: a layer's in their order, an LSTM's in those of its cell."""
+    made, counts = io.BytesIO(), Counter[str]()
+    arrays: dict[str, np.ndarray] = {}
+    for name, shape in shapes.items():
+        layer = name.partition("/")[0]
+        inside = f"layers/{layer}/cell" if layer == "lstm" else f"layers/{layer}"
+        arrays[f"{inside}/vars/{counts[layer]}"] = np.linspace(-1, 1, int(np.prod(shape)), dtype="f4").reshape(shape)
+        counts[layer] += 1
+    np.savez(made, **arrays)
+    return made.getvalue()
+
+
+def _web_layers() -> list[Files]:
+    """TensorFlow.js layers models."""
+    found = []
+    for kind, config, shapes in _layered():
+        weights = [{"name": name, "shape": list(shape), "dtype": "float32"} for name, shape in shapes.items()]
+        count = sum(int(np.prod(shape)) for shape in shapes.values())
+        topology = {"keras_version": "tfjs-layers 4.22.0", "backend": "tensor_flow.js"}
+        whole = {**topology, "model_config": {"class_name": kind, "config": config}}
+        manifest = [{"paths": ["weights.bin"], "weights": weights}]
+        content = {"format": "layers-model", "modelTopology": whole, "weightsManifest": manifest}
+        data = np.linspace(-1, 1, count, dtype=np.float32).tobytes()
+        found.append({"model.json": json.dumps(content).encode(), "weights.bin": data})
+    return found
 
 
 def _saved_zips() -> list[Files]:

@@ -20,6 +20,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from converters.formats.bundle.bundle import Bundle
 from converters.formats.keras.config import config_of, refuse_code
 from converters.formats.keras.source import build_layered
@@ -92,11 +94,12 @@ def _signature(data: bytes) -> PolicySignature:
 
 
 def _configuration(path: Path, out: Path) -> None:
-    """What is asked of a ``.keras`` before a process reads its weights, and of its layers without any."""
+    """A ``.keras``, but that its weights lie beside it: no process reads them."""
     with naming(path):
         config = config_of(path)
         refuse_code(config)
-        build_layered((path,), config, Groups({}), "3.0.0")
+        with np.load(path.with_name("weights.npz")) as stored:
+            build_layered((path,), config, Groups(dict(stored)), "3.0.0")
 
 
 COMMANDS: dict[str, tuple[Callable[[Path, Path], None], ...]] = {

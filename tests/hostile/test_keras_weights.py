@@ -16,7 +16,7 @@ from signatures.errors import DamagedFileError, NotAPolicyError, SourceError
 
 h5py = pytest.importorskip("h5py")
 
-LAYERS = [
+LAYERS: list[dict[str, Any]] = [
     {"class_name": "InputLayer", "config": {"name": "state", "batch_input_shape": [None, 3], "dtype": "float32"}},
     {"class_name": "Dense", "config": {"name": "action", "units": 2, "use_bias": False}},
 ]
@@ -103,6 +103,16 @@ def test_settings_that_do_not_fit_are_refused(tmp_path: Path, change: dict[str, 
     config = {"class_name": "Sequential", "config": {"name": "m", "layers": [LAYERS[0], dense]}}
     with pytest.raises((DamagedFileError, NotAPolicyError)):
         read(Fetched(written(tmp_path / "m.h5", plain, config)), ReadOptions())
+
+
+@pytest.mark.parametrize("dtype", ["f4,f4", f"{'9' * 5000}f4,f4", "object", "string", "M8[s]"], ids=lambda d: d[-9:])
+def test_an_input_is_of_numbers(tmp_path: Path, dtype: str) -> None:
+    """numpy reads a dtype with commas as Python, and raised SyntaxError at 5000 digits."""
+    layers = [{**LAYERS[0], "config": {**LAYERS[0]["config"], "dtype": dtype}}, LAYERS[1]]
+    path = written(tmp_path / "m.h5", plain, {"class_name": "Sequential", "config": {"name": "m", "layers": layers}})
+    with pytest.raises(NotAPolicyError, match="the input 'state' has the dtype '") as refused:
+        read(Fetched(path), ReadOptions())
+    assert len(str(refused.value)) < 500
 
 
 @pytest.mark.parametrize(

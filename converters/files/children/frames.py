@@ -54,7 +54,7 @@ def read_frame(stream: BinaryIO) -> tuple[dict[str, Any], Tensors]:
             data = _exactly(stream, math.prod(entry["shape"]) * dtype.itemsize)
             array = np.frombuffer(data, dtype.newbyteorder("<")).astype(dtype, copy=False)
             tensors[entry["name"]] = array.reshape(entry["shape"])
-    except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError, SyntaxError) as error:
         raise FramingError(f"what it said cannot be read as a frame: {error}") from error
     return header, tensors
 

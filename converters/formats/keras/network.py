@@ -16,6 +16,7 @@ from converters.formats.saved_model.signature import ModelSignature, Tensor
 from converters.graph.builder import Builder
 from converters.graph.nodes import MAX_NAME, NameScope, Node, TensorShape
 from converters.graph.types import FLOAT32
+from signatures.contract import DTYPES
 from signatures.errors import DamagedFileError, NotAPolicyError, UnsupportedOpError
 from signatures.memories import SeparateMemory
 
@@ -90,8 +91,14 @@ class Network(Builder):
                 fix="save the model with an Input of a fixed shape, the length of a history included",
             )
         dtype = layer.config.get("dtype") or "float32"
-        kind = np.dtype(str(dtype["config"]["name"] if isinstance(dtype, Mapping) else dtype))
-        kind = FLOAT32 if kind.kind == "f" else kind
+        named = str(dtype["config"]["name"] if isinstance(dtype, Mapping) else dtype)
+        if named not in DTYPES:  # np.dtype reads whatever looks like Python in a text
+            raise NotAPolicyError(
+                f"the input {layer.name!r} has the dtype {named[:80]!r}",
+                why=f"a policy is fed numbers: {', '.join(DTYPES)}",
+                fix="save the model with an Input of one of these",
+            )
+        kind = FLOAT32 if named.startswith("float") else np.dtype(named)
         dims = (None, *(int(n) for n in rest if n is not None))
         self.prefix = ""
         made = self.named_input(self._fresh(layer.name), kind, dims, layer.name)
