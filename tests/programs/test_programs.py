@@ -23,9 +23,11 @@ from exporter.export.pipeline import ExportOptions, export
 from exporter.export.sources import read_source
 from exporter.reports.summary import failure_lines
 from fixtures import FIXTURES, path
+from signatures.errors import UnsupportedOpError
 from tests import known
 from tests.conftest import Chosen
 from tests.graph.harness import Runtimes, policy_of
+from tests.handmade import constant, dense, graph_bytes, node, placeholder
 
 pytestmark = pytest.mark.xdist_group("programs")
 
@@ -189,3 +191,21 @@ def test_the_same_seed_draws_the_same_in_every_language(form: Format, tmp_path: 
 def test_csharp_allocates_nothing_for_a_decision(tmp_path: Path) -> None:
     """20,000 decisions, and not one collection of the youngest generation."""
     assert printed(WRITTEN["csharp"], tmp_path)[-1] == 0
+
+
+@pytest.mark.parametrize("form", PROGRAMS, ids=lambda form: form.key)
+def test_an_input_without_elements_is_refused_by_name(form: Format, tmp_path: Path) -> None:
+    """It came from a damaged model.json, and the self test was made of it all the same."""
+    nodes = [
+        placeholder("vector_observation"),
+        placeholder("prev_action", (None, 0), np.int32),
+        node("numbers", "Cast", "prev_action", DstT=np.float32),
+        constant("axis", 1),
+        node("seen", "ConcatV2", "vector_observation", "numbers", "axis"),
+        *dense("action", "seen", 3, 2),
+    ]
+    source = tmp_path / "empty.bytes"
+    source.write_bytes(graph_bytes(nodes))
+    (policy,) = read_source(source).policies()
+    with pytest.raises(UnsupportedOpError, match=r"'prev_action' \(prev_action\) .* it has the shape \[None, 0\]"):
+        form.artifact(policy, WriteOptions("{}"))

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from converters.graph.language import identifier
 from converters.graph.nodes import NameScope
 from signatures.code import CodeOptions
+from signatures.errors import UnsupportedOpError
 from signatures.records import dataclass
 from signatures.roles import Role
 from signatures.spec import PolicySignature, TensorSpec
@@ -70,7 +71,7 @@ def answers(signature: PolicySignature, code: CodeOptions | None = None) -> list
 
 
 def header_of(name: str, signature: PolicySignature, code: CodeOptions | None = None) -> Header:
-    """What the header of the policy ``name`` calls what."""
+    """What the header of the policy ``name`` calls what. Raises UnsupportedOpError where a member is empty."""
     word = identifier(name)
     prefix = word if not word[0].isdigit() else f"policy_{word}"
     memory_in, memory_out = signature.recurrence or ("", "")
@@ -94,6 +95,12 @@ def _fields(specs: Iterable[TensorSpec]) -> list[Field]:
         word = identifier(spec.name)
         size = 1
         for length in spec.shape[1:] if spec.batched else spec.shape:
-            size *= length or 1
+            size *= 1 if length is None else length
+        if not size:
+            raise UnsupportedOpError(
+                f"{spec.name!r} ({spec.role}) cannot be written as source code: it has the shape {list(spec.shape)}",
+                why="a member of a structure holds at least one number",
+                fix="leave that input out of the source, or export to onnx, saved_model, tfjs or bytes",
+            )
         found.append(Field(scope.fresh(f"x{word}" if word[0].isdigit() else word), spec, size))
     return found
