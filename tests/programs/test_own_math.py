@@ -24,6 +24,7 @@ from fixtures import FIXTURES, path
 from signatures.code import CodeOptions, code_options
 from signatures.errors import UsageError
 from tests.bench.own_math import measure
+from tests.programs.machines import MACHINES
 from tests.programs.mains import MAINS
 
 pytestmark = pytest.mark.xdist_group("programs")
@@ -57,6 +58,8 @@ def _compiled(policy: Policy, folder: Path) -> Iterator[tuple[str, list[str]]]:
             command = [each, "-Wall", "-Wextra", "-Wconversion", "-Werror", *flags.split(), "main.c", "-o", "main"]
             subprocess.run([*command, "-lm"], check=True, cwd=folder)
             yield f"{each} {flags}", [str(folder / "main")]
+    for machine in (m for m in MACHINES if not m.missing()):
+        yield machine.name, machine.build(folder)
     if (found := tools()) is not None:
         mcs, mono = found
         subprocess.run([mcs, "-langversion:7", "-out:main.exe", "main.cs", f"{policy.name}.cs"], check=True, cwd=folder)
