@@ -31,7 +31,7 @@ from converters.graph.ops.loops.base import (
 )
 from converters.graph.ops.table import is_fed, op_of
 from converters.graph.shapes import infer_types
-from converters.graph.types import FLOAT32, INT64, TensorType
+from converters.graph.types import BOOL, FLOAT32, INT64, TensorType
 from signatures.records import dataclass
 
 
@@ -176,6 +176,9 @@ class _Builder:
     def reduce(
         self, kind: Kind, lengths: Sequence[int], body: Callable[[tuple[Expression, ...]], Expression], dtype: np.dtype
     ) -> Expression:
+        if dtype == BOOL and kind in ("sum", "product"):
+            assert self.node is not None
+            raise loop_error(self.node, f"a {kind} of truth values: programs add and multiply numbers")
         counters, at = self._counters(lengths)
         if not counters and not kind.startswith("first"):
             return body(at)

@@ -6,7 +6,7 @@ import inspect
 from collections.abc import Mapping, Sequence
 from functools import cache
 from itertools import count
-from math import inf
+from math import inf, prod
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from converters.graph.nodes import Graph, Node, ref
 from converters.graph.ops.base import MISFIT, Kernel, OpDef, misfit, shape_error
 from converters.graph.ops.table import CONTROL_FLOW, op_of
 from converters.graph.size_limits import Allowance
-from converters.graph.types import FLOAT32, INT32, Symbols, TensorType, of_array
+from converters.graph.types import FLOAT32, INT32, Dim, Symbols, TensorType, of_array
 from signatures.errors import ExportModelError, GraphError
 
 Types = dict[str, TensorType]
@@ -168,6 +168,25 @@ def elements_of(kind: TensorType) -> int:
         if isinstance(length, int):
             count *= abs(length)
     return count
+
+
+def numbers_made(graph: Graph, rows: int) -> int:
+    """How many numbers the kernels make of a straight graph for so many rows: all results, and the windows that a
+    convolution looks at. A free axis counts as ``rows``: who computes what a file declares asks this first.
+    """
+    types, total = infer_types(graph), 0
+    for node in graph.nodes:
+        outputs = outputs_of(types, node.name)
+        sizes = [_length(types[ref(node.name, index)].shape, rows) for index in range(outputs)]
+        total += sum(sizes)
+        if op_of(node).layer == "convolution" and len(node.inputs) > 1:
+            kernel, channels = types[node.inputs[1]], (types[node.name].shape or (1,))[-1]
+            total += sizes[0] * elements_of(kernel) // max(1, channels if isinstance(channels, int) else 1)
+    return total
+
+
+def _length(shape: tuple[Dim, ...] | None, rows: int) -> int:
+    return prod(abs(d) if isinstance(d, int) else rows for d in shape or ())
 
 
 def _check_size(node: Node, args: Sequence[TensorType], results: Sequence[TensorType]) -> None:

@@ -7,7 +7,8 @@ import numpy as np
 from converters.graph.nodes import Graph, Node, node_of
 from converters.graph.ops.table import traits
 from converters.graph.run import run_graph
-from converters.graph.shapes import Types
+from converters.graph.shapes import Types, numbers_made
+from converters.graph.size_limits import MAX_COMPUTED
 from signatures.errors import GraphError
 
 #: What a free axis behind the batch counts as.
@@ -72,6 +73,8 @@ def _seen_at(
             return None
         shape = [1 if i == 0 and n is None else _FREE_AXIS if n is None else n for i, n in enumerate(each.dims)]
         feeds[each.name] = np.zeros(shape, each.attrs["dtype"])
+    if numbers_made(graph.prune([reference]), _FREE_AXIS) > MAX_COMPUTED:
+        return None
     kind = np.dtype(np.int64) if node.attrs["dtype"].kind in "iu" else node.attrs["dtype"]
     try:
         made = [

@@ -16,6 +16,8 @@ from signatures.errors import GraphError
 from signatures.memories import SeparateMemory
 
 Shape = tuple[int | None, ...]
+#: Numbers of a memory whose parts are told apart, and those of all that is made of it on the way.
+_MOST_COLUMNS, _MOST_FOLLOWED = 1 << 16, 1 << 21
 
 
 def paired_memories(
@@ -65,12 +67,12 @@ def memory_layout(graph: Graph, name: str) -> tuple[str, ...]:
     """
     types = infer_types(graph)
     shape = types[name].shape
-    if not shape or not isinstance(shape[-1], int):
+    if not shape or not isinstance(shape[-1], int) or shape[-1] > _MOST_COLUMNS:
         return ()
     # tensor → the columns of the memory that it shows, as one row of it
     shown = {name: np.arange(shape[-1]).reshape((1,) * (len(shape) - 1) + (shape[-1],))}
     parts: dict[tuple[int, ...], str] = {}
-    allowance = Allowance()
+    allowance = Allowance(_MOST_FOLLOWED)
     for node in graph.nodes:
         read = [shown[r] for r in node.inputs if r in shown]
         operands = [shown.get(r, types[r].constant) for r in node.inputs]

@@ -18,6 +18,7 @@ from converters.graph.editor import Editor
 from converters.graph.nodes import Graph, Node, TensorShape
 from converters.graph.ops.table import is_fed, op_of, traits
 from converters.graph.shapes import infer_types
+from converters.graph.size_limits import MAX_MADE, Allowance
 from converters.graph.types import BATCH, FLOAT32, INT32, Dim, static_shape
 from signatures.errors import UnsupportedOpError
 from signatures.roles import Role
@@ -91,7 +92,7 @@ def lift_noise(graph: Graph, mode: NoiseMode, inputs: Collection[str] = ()) -> G
     if mode == "keep" or not (samplers(graph) or any(n.name in fed for n in graph.nodes)):
         return graph
     types = infer_types(graph)
-    editor = Editor(graph)
+    editor, allowance = Editor(graph), Allowance()
     for node in graph.nodes:
         if traits(node).sampler != "normal" and node.name not in fed:
             editor.keep(node)
@@ -108,7 +109,7 @@ def lift_noise(graph: Graph, mode: NoiseMode, inputs: Collection[str] = ()) -> G
         assert dims is not None
         if mode == "zero":
             # One row of zeros broadcasts over the batch.
-            zeros = np.zeros([1 if d is None else d for d in dims], np.float32)
+            zeros = _zeros(node, dims, allowance)
             editor.nodes.append(Node(node.name, "Const", value=zeros, origin=node.origin))
         elif _leads(dims):
             attrs = {"dtype": FLOAT32, "shape": TensorShape(dims)}
@@ -156,6 +157,19 @@ def _move_batch_first(editor: Editor, node: Node, dims: Sequence[int | None]) ->
     editor.nodes.append(Node(node.name, "Transpose", (rows, order), attrs={}))
 
 
+def _zeros(node: Node, dims: Sequence[int | None], allowance: Allowance) -> np.ndarray:
+    """One row of no noise. Raises UnsupportedOpError where all rows of a graph would be more than any policy's."""
+    shape = [1 if d is None else d for d in dims]
+    if not allowance.take(math.prod(shape)):
+        raise UnsupportedOpError(
+            f"cannot leave out the noise of {node.name!r}: it is {math.prod(shape)} numbers for an agent",
+            issues=[(node.name, node.op)],
+            why=f"no more than {MAX_MADE} are made of all noise of a policy",
+            fix="the file is damaged, or name an output without noise: --output NODE=action",
+        )
+    return np.zeros(shape, np.float32)
+
+
 def without_noise(
     graph: Graph, references: Sequence[str], noise: Mapping[str, tuple[int | None, ...]], prefix: str
 ) -> tuple[Graph, list[str]]:
@@ -169,7 +183,7 @@ def without_noise(
     if not wanted:
         return graph, [*references]
     types = infer_types(graph)
-    editor = Editor(graph)
+    editor, allowance = Editor(graph), Allowance()
     copies: dict[str, str] = {}
     zeros: set[str] = set()
     for node in graph.nodes:
@@ -178,8 +192,7 @@ def without_noise(
         if node.name not in wanted:
             continue
         if node.name in noise:
-            shape = [1 if d is None else d for d in noise[node.name]]
-            copies[node.name] = editor.const(np.zeros(shape, np.float32), f"{prefix}/zero")
+            copies[node.name] = editor.const(_zeros(node, noise[node.name], allowance), f"{prefix}/zero")
             zeros.add(copies[node.name])
             continue
         inputs = [_copy_of(r, copies) for r in node.inputs]

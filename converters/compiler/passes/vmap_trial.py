@@ -5,7 +5,6 @@ A constant that was made for one row (torch's ``arange`` over the batch, an inde
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
@@ -14,13 +13,12 @@ import numpy as np
 from converters.compiler.passes.normalise import normalise
 from converters.graph.nodes import Graph, Node, TensorShape, ref
 from converters.graph.ops.table import op_of
-from converters.graph.shapes import infer_types, run_kernel
+from converters.graph.shapes import infer_types, numbers_made, run_kernel
+from converters.graph.size_limits import MAX_COMPUTED
 from converters.graph.types import TensorType
 from signatures.errors import SignatureError
 
 ROWS = 3
-#: Numbers that the trial may make: all tensors of all rows together. A policy has some thousands, a camera's a million.
-MAX_NUMBERS = 1 << 24
 
 
 def check_rows(graph: Graph, outputs: Sequence[str]) -> None:
@@ -130,8 +128,7 @@ def _part(array: np.ndarray, shape: Sequence[int], row: int) -> np.ndarray | Non
 
 def too_large(graph: Graph) -> bool:
     """Whether a trial takes more numbers than any policy does: shapes are what a file claims."""
-    shapes = (kind.shape or () for kind in infer_types(normalise(graph)).values())
-    return sum(math.prod(d if isinstance(d, int) else ROWS for d in shape) for shape in shapes) > MAX_NUMBERS
+    return numbers_made(normalise(graph), ROWS) > MAX_COMPUTED
 
 
 def _free(kind: TensorType) -> int | None:

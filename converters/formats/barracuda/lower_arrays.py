@@ -22,6 +22,8 @@ from converters.graph.types import BATCH, Dim
 #: What is refused, and why.
 _CUTS_AGENTS = "it cuts agents out of the batch", "a policy answers for every agent"
 _MIXED = "the numbers of one agent stay in one row of a .nn"
+#: Operands of a layer that joins a tensor with itself.
+_MOST_JOINED = 1 << 12
 
 
 # ------------------------------------------------------------------ shapes
@@ -313,9 +315,18 @@ def tile(b: NnBuilder, args: Sequence[Value]) -> Value:
         if value.shape[axis] == BATCH:
             raise b.nn_error("it repeats agents", "a policy answers once for every agent")
         longer = tuple(d * count if i == axis and isinstance(d, int) else d for i, d in enumerate(value.shape))
-        value = join_along(b, [value] * count, axis, longer)
+        value = join_along(b, _repeated(b, value, count), axis, longer)
     assert value.shape == shape
     return value
+
+
+def _repeated(b: NnBuilder, value: Value, times: int) -> list[Value]:
+    """A tensor as the operands of a layer that joins it with itself. Raises UnsupportedOpError."""
+    if times > _MOST_JOINED:
+        raise b.nn_error(
+            f"it repeats a tensor {times} times", f"a layer that joins takes {_MOST_JOINED} operands, no more"
+        )
+    return [value] * times
 
 
 def _tile(b: NnBuilder, array: np.ndarray, shape: tuple[Dim, ...]) -> Value:
@@ -341,7 +352,7 @@ def broadcast_to(b: NnBuilder, args: Sequence[Value]) -> Value:
         if not isinstance(wanted, int):
             raise b.nn_error("it repeats a row for every agent", "only a constant can be repeated so")
         longer = tuple(wanted if i == axis else d for i, d in enumerate(value.shape))
-        value = join_along(b, [value] * wanted, axis, longer)
+        value = join_along(b, _repeated(b, value, wanted), axis, longer)
     return value
 
 

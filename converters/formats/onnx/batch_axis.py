@@ -15,11 +15,12 @@ from typing import Any
 import numpy as np
 
 from converters.compiler.passes.vmap import for_every_row
-from converters.compiler.passes.vmap_trial import MAX_NUMBERS, ROWS, check_rows, too_large
+from converters.compiler.passes.vmap_trial import ROWS, check_rows, too_large
 from converters.formats.onnx.importer.importer import Importer
 from converters.formats.onnx.importer.node import DTYPES
 from converters.graph.nodes import Graph
 from converters.graph.shapes import Types, infer_types
+from converters.graph.size_limits import MAX_COMPUTED
 from signatures.errors import ExportModelError, NotAPolicyError, SignatureError
 from signatures.records import dataclass
 
@@ -218,7 +219,7 @@ def _fault(importer: Importer, outputs: Sequence[Any], *, said: bool = False) ->
             return None
         raise SignatureError(
             "the model was exported for one row, and is too large to be tried with more",
-            why=f"its tensors hold more than {MAX_NUMBERS} numbers for {ROWS} rows",
+            why=f"its tensors hold more than {MAX_COMPUTED} numbers for {ROWS} rows",
             fix="export it again with the batch left free everywhere",
         )
     try:

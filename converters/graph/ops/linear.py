@@ -83,6 +83,8 @@ def _product(a: np.ndarray, b: np.ndarray, wide: Callable[[np.ndarray], np.ndarr
 def _infer_matmul(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
     require_one_dtype(node, args[:2])
     a, b = args[0].shape, args[1].shape
+    if BOOL in (args[0].dtype, args[1].dtype):
+        raise shape_error(node, args, f"a product of {args[0].dtype} and {args[1].dtype}; it takes numbers")
     if a is None or b is None:
         return [TensorType(args[0].dtype, (symbols.fresh(), symbols.fresh()) if node.op == "MatMul" else None)]
     if len(a) < 2 or len(b) < 2 or (node.op == "MatMul" and (len(a), len(b)) != (2, 2)):
