@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from enum import StrEnum
 
@@ -15,6 +16,8 @@ from signatures.spec import PolicySignature
 
 #: Elements of one input that are run at once.
 CHUNK_ELEMENTS = 1 << 21
+#: Steps of an episode that are run one after the other before others are run side by side with them.
+SHORT = 256
 
 
 class MemoryUse(StrEnum):
@@ -55,34 +58,56 @@ class Replay:
         return {n: np.concatenate([p[n] for p in parts]) for n in fetch}
 
     def _step_by_step(self, inputs: Arrays, before: Array, use: MemoryUse, taken: str, given: str) -> dict[str, Array]:
+        """Stretches of an episode side by side, each from the memory that the stretch before left when it was last
+        run; those whose memory has changed since run again, until none has. Stretch n is right after n runs, so that
+        no step is computed otherwise than one after the other; a memory that forgets is right after two or three.
+        """
         spec = self.signature.input(taken)
         rows = len(before)
         memory = np.zeros((rows + 1, *(n or 1 for n in spec.shape[1:])), np.float32)  # the last row is what NONE finds
+        if use is MemoryUse.DROPPED:
+            return self._at_once({**inputs, taken: memory[:-1]}, self.fetch)
+        source = np.where(before == NONE, NONE, before[before]) if use is MemoryUse.LATE else before
+        step, stretch = _stretches(before)
+        ends = np.flatnonzero((source != NONE) & (stretch[source] != stretch))
         fetch = tuple(dict.fromkeys([*self.fetch, given]))
         found: dict[str, Array] = {}
-        for level in _levels(before):
-            source = before[level]
-            if use is MemoryUse.LATE:
-                source = np.where(source == NONE, NONE, before[source])
-            fed = np.zeros_like(memory[source]) if use is MemoryUse.DROPPED else memory[source]
-            answer = self._at_once({**{n: a[level] for n, a in inputs.items()}, taken: fed}, fetch)
-            memory[level] = answer[given]
-            for name, array in answer.items():
-                if name not in found:
-                    found[name] = np.zeros((rows, *array.shape[1:]), array.dtype)
-                found[name][level] = array
+        again = np.arange(rows)
+        while len(again):
+            fed_at_ends = memory[source[ends]].view(np.uint32)  # NaN is equal to itself so
+            for level in _levels(again, step):
+                answer = self._at_once(
+                    {**{n: a[level] for n, a in inputs.items()}, taken: memory[source[level]]}, fetch
+                )
+                memory[level] = answer[given]
+                for name, array in answer.items():
+                    if name not in found:
+                        found[name] = np.zeros((rows, *array.shape[1:]), array.dtype)
+                    found[name][level] = array
+            differs = (memory[source[ends]].view(np.uint32) != fed_at_ends).any(axis=tuple(range(1, memory.ndim)))
+            again = np.flatnonzero(np.isin(stretch, stretch[ends[differs]]))
         return found
 
 
-def _levels(before: Array) -> list[Array]:
-    """Rows that can be run at once, in order: those whose step before is in an earlier part."""
-    depth = np.zeros(len(before) + 1, np.int64)
+def _stretches(before: Array) -> tuple[Array, Array]:
+    """Of each row its step within a stretch of its episode, and the number of that stretch."""
+    rows = len(before)
+    depth, first = np.zeros(rows + 1, np.int64), np.arange(rows + 1)
     depth[NONE] = -1
-    for row, source in enumerate(before.tolist()):
-        depth[row] = depth[source] + 1
-    order = np.argsort(depth[:-1], kind="stable")
-    edges = np.flatnonzero(np.diff(depth[:-1][order])) + 1
-    return np.split(order, edges)
+    for row, at in enumerate(before.tolist()):
+        depth[row] = depth[at] + 1
+        if at != NONE:
+            first[row] = first[at]
+    depth, first = depth[:-1], first[:-1]
+    length = max(SHORT, math.isqrt(int(depth.max(initial=0))))
+    number = np.unique(np.stack([first, depth // length]), axis=1, return_inverse=True)[1]
+    return depth % length, number.reshape(-1)
+
+
+def _levels(rows: Array, step: Array) -> list[Array]:
+    """Rows that can be run at once, in order: those of one step."""
+    order = rows[np.argsort(step[rows], kind="stable")]
+    return np.split(order, np.flatnonzero(np.diff(step[order])) + 1)
 
 
 def complete(inputs: Arrays, outputs: Arrays, before: Array, signature: PolicySignature) -> dict[str, Array]:
