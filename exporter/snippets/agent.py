@@ -7,6 +7,7 @@ OnActionReceived, Heuristic); read, not compiled here.
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 
 from exporter.snippets.contract import Bundle, branch_lines, class_name, fill_template, number_names, wrap_items
 from signatures.roles import SENSOR_ORDER, Role
@@ -15,12 +16,12 @@ from signatures.spec import TensorSpec
 
 def agent(bundle: Bundle) -> str:
     """The class, and the settings as a comment above it."""
-    sensors = _sensors(bundle)
-    vector = next((s for s in reversed(sensors) if s.role is Role.VECTOR and len(s.shape) < 3), None)
+    sensors = ordered_sensors(bundle)
+    vector = vector_sensor(sensors)
     received, own = _actions(bundle)
     return fill_template(
         "agent.cs",
-        type=_class(bundle.name),
+        type=script_name(bundle.name),
         head="\n".join(_head(bundle, sensors, vector)),
         observations="" if vector is None else _observations(bundle, vector),
         masks=fill_template("agent_masks.cs") if bundle.signature.branches else "",
@@ -34,17 +35,24 @@ def _inside(lines: list[str]) -> str:
     return "".join(f"        {line}\n" for line in lines)
 
 
-def _class(name: str) -> str:
+def script_name(name: str) -> str:
+    """The class of the agent."""
     word = class_name(name)
     return f"Agent{word.removeprefix('Policy')}" if word.startswith("Policy") else f"{word.removesuffix('Policy')}Agent"
 
 
-def _sensors(bundle: Bundle) -> list[TensorSpec]:
+def ordered_sensors(bundle: Bundle) -> list[TensorSpec]:
+    """The observations in the order in which Unity feeds them."""
     specs = list(bundle.signature.observations)
     numbers = {s.name: int(s.name.removeprefix("obs_")) for s in specs if re.fullmatch("obs_[0-9]+", s.name)}
     if len(numbers) == len(specs):
         return sorted(specs, key=lambda s: numbers[s.name])
     return sorted(specs, key=lambda s: SENSOR_ORDER.index(s.role))
+
+
+def vector_sensor(sensors: Sequence[TensorSpec]) -> TensorSpec | None:
+    """The one that ``CollectObservations`` fills."""
+    return next((s for s in reversed(sensors) if s.role is Role.VECTOR and len(s.shape) < 3), None)
 
 
 def _head(bundle: Bundle, sensors: list[TensorSpec], vector: TensorSpec | None) -> list[str]:
@@ -62,7 +70,7 @@ def _head(bundle: Bundle, sensors: list[TensorSpec], vector: TensorSpec | None) 
     others = [s for s in sensors if s is not vector]
     if others:
         lines.append("Sensor components, called so that they sort in this order (Unity feeds them by name):")
-        lines += [f"  {number} {_component(bundle, spec)}" for number, spec in enumerate(others)]
+        lines += [f"  {number} {component_text(bundle, spec)}" for number, spec in enumerate(others)]
     if signature.memory is not None:
         lines.append(
             f"Its memory ({signature.memory.size} numbers) is kept by ML-Agents, and is empty at an episode's start."
@@ -82,7 +90,8 @@ def _model(bundle: Bundle) -> str:
     return f"{bundle.name}.onnx of a bundle made with --for unity6 (export-model --for help: for older ones)"
 
 
-def _component(bundle: Bundle, spec: TensorSpec) -> str:
+def component_text(bundle: Bundle, spec: TensorSpec) -> str:
+    """Which sensor component shows an observation."""
     lengths = [n or 0 for n in spec.shape[1:]]
     if spec.role is Role.VISUAL and len(lengths) == 3:
         layout = bundle.signature.preprocess.get(spec.name, {}).get("layout", "NHWC")

@@ -9,7 +9,7 @@ from typing import Any
 
 from converters.formats.format import Code, Format
 from converters.formats.registry import BARRACUDA, CSHARP, FROZEN_GRAPH, ONNX, SAVED_MODEL, TFJS, WRITTEN
-from exporter.snippets import agent, csharp, godot, javascript, python, serving, unity
+from exporter.snippets import agent, csharp, godot, javascript, python, recorders, serving, unity
 from exporter.snippets.contract import Bundle, string_literal
 from signatures.errors import BundleError, UsageError
 from signatures.records import dataclass
@@ -64,6 +64,15 @@ TARGETS: tuple[Target, ...] = (
 def _fill_code(found: Format, code: Code, bundle: Bundle) -> str:
     return Template(code.text).substitute(path=string_literal(bundle.path(found.main_of(bundle.name))))
 
+
+#: What writes a log needs no file of the policy.
+_ANY = tuple(WRITTEN.values())
+TARGETS += (
+    Target("recorder-unity", "A log from Unity, beside an ML-Agents Agent, C#", "csharp", _ANY, recorders.unity),
+    Target("recorder-gymnasium", "A log from Gymnasium, Python", "python", _ANY, recorders.gymnasium),
+    Target("recorder-ros2", "A log from ROS 2, Python", "python", _ANY, recorders.ros2),
+    Target("recorder-isaac-lab", "A log from Isaac Lab, Python", "python", _ANY, recorders.isaac_lab),
+)
 
 # The snippets that formats bring themselves.
 TARGETS += tuple(
