@@ -23,7 +23,7 @@ from exporter.cli.terminal import say
 )
 @click.option("-o", "--out", type=PATH, help="Folder for it all (default: demo; with --files, this one).")
 @click.option("--no-open", is_flag=True, help="Do not open the page; exit once everything is written.")
-@click.option("--files", is_flag=True, help="Write policies to try: .bytes, .onnx, .nn, a run, memory.")
+@click.option("--files", is_flag=True, help="Write policies to try, and their environments for Gymnasium.")
 def demo_command(out: Path | None, no_open: bool, files: bool) -> None:
     """Export a trained 3DBall that comes with the package, compare the formats in the installed runtimes, and open
     the page on which it acts.

@@ -1,8 +1,11 @@
-"""``export-model demo --files``: one policy in each form that a user may have, so that every command can be tried."""
+"""``export-model demo --files``: one policy in each form that a user may have, so that every command can be tried, and
+the environments that policies are trained in, so that other programs can play them.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from importlib.resources import files
 from pathlib import Path
 
 from converters.files.folders import scratch_folder
@@ -15,6 +18,8 @@ from signatures.errors import UsageError
 
 #: The run of the documentation: a folder for each behavior, as ML-Agents 0.7 to 0.23 leaves it.
 _RUN = "results/first_run"
+#: The modules of the environments.
+_WORLDS = ("base", "ball3d", "crawler2d", "gridworld", "hallway", "tennis")
 #: Path → what it is, in the order in which they are listed.
 FILES: Mapping[str, str] = {
     "3DBall.bytes": "a frozen TensorFlow graph (ML-Agents 0.7 to 0.8)",
@@ -23,6 +28,8 @@ FILES: Mapping[str, str] = {
     "Hallway.bytes": "a policy with memory (LSTM)",
     f"{_RUN}/3DBall/frozen_graph_def.pb": "a training run of two behaviors",
     f"{_RUN}/Hallway/frozen_graph_def.pb": "",
+    "environments/__init__.py": "what they were trained in, and three others, for Gymnasium",
+    **{f"environments/{name}.py": "" for name in _WORLDS},
 }
 
 
@@ -47,4 +54,12 @@ def _contents() -> list[bytes]:
         forms = (ONNX, BARRACUDA)
         (result,) = export([BALL], ExportOptions(Path(folder), [f.key for f in forms], verify="none"))
         onnx, barracuda = ((result.folder / f.main_of(BALL.stem)).read_bytes() for f in forms)
-    return [ball, onnx, barracuda, hallway, ball, hallway]
+    return [ball, onnx, barracuda, hallway, ball, hallway, *_environments()]
+
+
+def _environments() -> list[bytes]:
+    """Their Gymnasium form, and what it imports: the package's own modules, each beside the others."""
+    form = files("exporter.demo").joinpath("gymnasium_form.py.tmpl").read_bytes()
+    room = files("exporter.play.environments")
+    own = (room.joinpath(f"{name}.py").read_text(encoding="utf-8") for name in _WORLDS)
+    return [form, *(text.replace("from exporter.play.environments.", "from .").encode() for text in own)]

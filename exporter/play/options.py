@@ -21,7 +21,7 @@ class PlayOptions:
     #: Take the likeliest action and the mean, in place of draws.
     deterministic: bool = False
     #: Where the episodes do not decide, as many others as would are played, up to this number.
-    most: int = 1600
+    most: int = 12_800
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "episodes", whole("episodes", self.episodes, LEAST_EPISODES, MOST_EPISODES))
