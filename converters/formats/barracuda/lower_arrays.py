@@ -315,12 +315,12 @@ def tile(b: NnBuilder, args: Sequence[Value]) -> Value:
         if value.shape[axis] == BATCH:
             raise b.nn_error("it repeats agents", "a policy answers once for every agent")
         longer = tuple(d * count if i == axis and isinstance(d, int) else d for i, d in enumerate(value.shape))
-        value = join_along(b, _repeated(b, value, count), axis, longer)
+        value = join_along(b, _copies_of(b, value, count), axis, longer)
     assert value.shape == shape
     return value
 
 
-def _repeated(b: NnBuilder, value: Value, times: int) -> list[Value]:
+def _copies_of(b: NnBuilder, value: Value, times: int) -> list[Value]:
     """A tensor as the operands of a layer that joins it with itself. Raises UnsupportedOpError."""
     if times > _MOST_JOINED:
         raise b.nn_error(
@@ -352,7 +352,7 @@ def broadcast_to(b: NnBuilder, args: Sequence[Value]) -> Value:
         if not isinstance(wanted, int):
             raise b.nn_error("it repeats a row for every agent", "only a constant can be repeated so")
         longer = tuple(wanted if i == axis else d for i, d in enumerate(value.shape))
-        value = join_along(b, _repeated(b, value, wanted), axis, longer)
+        value = join_along(b, _copies_of(b, value, wanted), axis, longer)
     return value
 
 
