@@ -1,12 +1,14 @@
 """Snippets in JavaScript: policy.mjs, plain TensorFlow.js and onnxruntime-web, each a page of its own, or for Node.
 
-A page lies beside the bundle's folder and takes its runtime from ``node_modules`` there: no network is needed.
+A page lies beside the bundle's folder and takes its runtime from ``node_modules`` there, so that no network is needed,
+or from a CDN by its hash.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from enum import StrEnum
 
 from exporter.snippets.contract import (
     STEPS,
@@ -18,11 +20,9 @@ from exporter.snippets.contract import (
     meaning,
     string_literal,
 )
+from exporter.snippets.packages import ORT, TFJS, Package
 from signatures.roles import Role
 from signatures.spec import TensorSpec
-
-_TFJS = ("@tensorflow/tfjs", "@tensorflow/tfjs/dist/tf.fesm.min.js")
-_ORT = ("onnxruntime-web", "onnxruntime-web/dist/ort.wasm.bundle.min.mjs")
 
 #: What holds a tensor's numbers (float16: their bits, as onnxruntime-web takes them).
 _ARRAYS = {
@@ -41,42 +41,50 @@ _ARRAYS = {
 }
 
 
-def acting_tfjs(bundle: Bundle) -> str:
+class Place(StrEnum):
+    """Where the code runs, and where its runtime comes from."""
+
+    PAGE = "page"
+    CDN = "cdn"
+    NODE = "node"
+
+
+def acting_tfjs(bundle: Bundle, place: Place = Place.PAGE) -> str:
     """policy.mjs with TensorFlow.js."""
-    return _page(bundle, _TFJS, "acting_tfjs.mjs", "tfjs/model.json", _agents(bundle))
+    return _program(bundle, TFJS, "acting_tfjs.mjs", "tfjs/model.json", _agents(bundle), place)
 
 
-def acting_node(bundle: Bundle) -> str:
-    """policy.mjs with TensorFlow.js, for Node."""
-    return _program(bundle, _TFJS, "acting_tfjs.mjs", "tfjs/model.json", _agents(bundle), "node.mjs")
-
-
-def acting_ort(bundle: Bundle) -> str:
+def acting_ort(bundle: Bundle, place: Place = Place.PAGE) -> str:
     """policy.mjs with onnxruntime-web."""
-    return _page(bundle, _ORT, "acting_ort.mjs", f"{bundle.name}.onnx", _agents(bundle))
+    return _program(bundle, ORT, "acting_ort.mjs", f"{bundle.name}.onnx", _agents(bundle), place)
 
 
-def plain_tfjs(bundle: Bundle) -> str:
+def plain_tfjs(bundle: Bundle, place: Place = Place.PAGE) -> str:
     """``tf.loadGraphModel`` alone."""
     run = "const outputs = model.predict(feeds);  // tensors by name; dispose of them in a long run: tf.dispose"
     play = _plain(bundle, _tf_value, run, "const {} = await outputs[{}].array();")
-    return _page(bundle, _TFJS, "plain_tfjs.mjs", "tfjs/model.json", play)
+    if place is Place.NODE:  # there is no loader for files in the package
+        return _program(bundle, TFJS, "plain_tfjs_node.mjs", "tfjs/", play, place)
+    return _program(bundle, TFJS, "plain_tfjs.mjs", "tfjs/model.json", play, place)
 
 
-def plain_ort(bundle: Bundle) -> str:
+def plain_ort(bundle: Bundle, place: Place = Place.PAGE) -> str:
     """onnxruntime-web alone."""
     run = "const outputs = await session.run(feeds);"
     play = _plain(bundle, _ort_value, run, "const {} = Array.from(outputs[{}].data, Number);")
-    return _page(bundle, _ORT, "plain_ort.mjs", f"{bundle.name}.onnx", play)
+    frame = "plain_ort_node.mjs" if place is Place.NODE else "plain_ort.mjs"
+    return _program(bundle, ORT, frame, f"{bundle.name}.onnx", play, place)
 
 
-def _page(bundle: Bundle, runtime: tuple[str, str], frame: str, model: str, play: str) -> str:
-    return _program(bundle, runtime, frame, model, play, "page.html")
-
-
-def _program(bundle: Bundle, runtime: tuple[str, str], frame: str, model: str, play: str, whole: str) -> str:
-    code = fill_template(frame, module=_url(bundle, "tfjs/policy.mjs"), model=_url(bundle, model), play=play)
-    return fill_template(whole, name=bundle.name, package=runtime[0], module=runtime[1], code=code.rstrip())
+def _program(bundle: Bundle, runtime: Package, frame: str, model: str, play: str, place: Place) -> str:
+    code = fill_template(frame, module=_url(bundle, "tfjs/policy.mjs"), model=_url(bundle, model), play=play).rstrip()
+    install = f"npm install {runtime.name}@{runtime.version}"
+    if place is Place.NODE:
+        return fill_template("node.mjs", name=bundle.name, how=install, code=code)
+    server = "python3 -m http.server"
+    how = server if place is Place.CDN else f"{install}; {server}"
+    imports = runtime.import_map(cdn=place is Place.CDN)
+    return fill_template("page.html", name=bundle.name, how=how, imports=imports, code=code)
 
 
 def _url(bundle: Bundle, relative: str) -> str:

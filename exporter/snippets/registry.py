@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from string import Template
 from typing import Any
@@ -38,6 +38,28 @@ class Target:
         return " or ".join(map(" and ".join, self.alternatives))
 
 
+def _javascript(
+    name: str,
+    title: str,
+    need: Format | tuple[Format, ...],
+    render: Callable[[Bundle, javascript.Place], str],
+    *,
+    node: str = "",
+) -> Iterator[Target]:
+    """A page with its runtime beside it, the same with it from a CDN, and a program for Node."""
+    places = (
+        (name, "A page", "html", javascript.Place.PAGE),
+        (f"{name}-cdn", "A page, runtime from a CDN", "html", javascript.Place.CDN),
+        (node or f"{name}-node", "Node", "js", javascript.Place.NODE),
+    )
+    for called, where, language, place in places:
+        yield Target(called, f"{where}, {title}", language, (need,), partial(_render_at, render, place))
+
+
+def _render_at(render: Callable[[Bundle, javascript.Place], str], place: javascript.Place, bundle: Bundle) -> str:
+    return render(bundle, place)
+
+
 TARGETS: tuple[Target, ...] = (
     Target("load-policy", "Python, exporter.load_policy", "python", (ONNX, FROZEN_GRAPH), python.load_policy),
     Target("onnxruntime", "Python, onnxruntime", "python", (ONNX,), python.onnxruntime),
@@ -45,11 +67,10 @@ TARGETS: tuple[Target, ...] = (
     Target("serving-docker", "TensorFlow Serving, the container", "sh", (SAVED_MODEL,), serving.docker),
     Target("serving-rest", "TensorFlow Serving, REST with curl", "sh", (SAVED_MODEL,), serving.rest),
     Target("serving-grpc", "TensorFlow Serving, gRPC from Python", "python", (SAVED_MODEL,), serving.grpc),
-    Target("policy-tfjs", "A page, policy.mjs with TensorFlow.js", "html", (TFJS,), javascript.acting_tfjs),
-    Target("policy-node", "Node, policy.mjs with TensorFlow.js", "js", (TFJS,), javascript.acting_node),
-    Target("policy-ort", "A page, policy.mjs with onnxruntime-web", "html", ((TFJS, ONNX),), javascript.acting_ort),
-    Target("tfjs", "A page, tf.loadGraphModel", "html", (TFJS,), javascript.plain_tfjs),
-    Target("onnxruntime-web", "A page, onnxruntime-web", "html", (ONNX,), javascript.plain_ort),
+    *_javascript("policy-tfjs", "policy.mjs with TensorFlow.js", TFJS, javascript.acting_tfjs, node="policy-node"),
+    *_javascript("policy-ort", "policy.mjs with onnxruntime-web", (TFJS, ONNX), javascript.acting_ort),
+    *_javascript("tfjs", "tf.loadGraphModel", TFJS, javascript.plain_tfjs),
+    *_javascript("onnxruntime-web", "onnxruntime-web", ONNX, javascript.plain_ort),
     Target("tensorflowsharp", "C#, TensorFlowSharp", "csharp", (FROZEN_GRAPH,), csharp.tensorflowsharp),
     Target(
         "internal-brain", "Unity, Internal Brain (ML-Agents 0.1 to 0.6)", "text", (FROZEN_GRAPH,), unity.internal_brain

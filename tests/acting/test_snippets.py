@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import base64
 import functools
+import hashlib
 import http.server
 import importlib.util
 import json
@@ -27,6 +29,7 @@ from exporter import export_model, load_policy
 from exporter.acting.policy import LoadedPolicy
 from exporter.export.pipeline import ExportOptions, export
 from exporter.snippets.contract import Bundle, read_bundle
+from exporter.snippets.packages import CDN, PACKAGES, TFJS, Package
 from exporter.snippets.registry import TARGETS, snippets
 from fixtures import path as fixture
 from signatures.errors import ExportModelError
@@ -37,6 +40,7 @@ from tests.commands import export_model as run
 KINDS = ("continuous", "discrete", "sampled", "recurrent", "visual", "twobrains")
 NAMES = (*KINDS[:-1], "twobrains-StrikerBrain", "twobrains-Goalie-Brain-2", "own-names-Goalie-Brain-2")
 SHARED = ROOT.parent / "shared"
+LOCKED = ROOT / "converters" / "runtimes" / "javascript" / "js"
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
 
@@ -235,19 +239,53 @@ def test_what_a_page_is_told_gives_what_numpy_gives(
 
 @pytest.mark.browser
 @pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
-@pytest.mark.parametrize("target", PAGES)
+@pytest.mark.parametrize("target", [*PAGES, *(f"{page}-cdn" for page in PAGES)])
 def test_a_page_runs_in_a_browser(target: str, out: Path, tmp_path: Path) -> None:
+    """With a CDN that is this machine: the browser holds its file to the hash all the same."""
+    page = code_of(out, "recurrent", target).replace(f"{CDN}/", "./cdn/")
+    *logged, shown = answers_of(page, out, tmp_path, 4)
+    for (values,) in logged:
+        assert np.size(values) == 2, logged
+    # The page posts them side by side, so they may arrive in another order.
+    assert sorted(json.loads(line) for line in shown.splitlines()) == sorted(values for (values,) in logged)
+
+
+@pytest.mark.browser
+@pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
+def test_a_browser_runs_no_other_file_of_a_cdn(out: Path, tmp_path: Path) -> None:
+    page = code_of(out, "recurrent", "tfjs-cdn").replace(f"{CDN}/", "./cdn/")
+    (said,) = answers_of(page.replace(TFJS.sha384, TFJS.sha384[::-1]), out, tmp_path, 1)
+    assert said == "not loaded"
+
+
+@pytest.mark.parametrize("package", PACKAGES, ids=lambda p: p.name)
+def test_a_package_of_a_cdn_is_the_one_that_is_tested_with(package: Package) -> None:
+    installed = js_home() / "node_modules" / package.name
+    if not installed.is_dir():
+        pytest.skip(f"{package.name} is not here: make install")
+    lock = json.loads((LOCKED / "package-lock.json").read_text())
+    assert lock["packages"][f"node_modules/{package.name}"]["version"] == package.version
+    digest = hashlib.sha384((installed / package.module).read_bytes()).digest()
+    assert base64.b64encode(digest).decode() == package.sha384
+
+
+def answers_of(page: str, out: Path, tmp_path: Path, count: int) -> list[Any]:
+    """What a page prints, and last what it shows, in Chromium; packages lie in node_modules and as a CDN has them."""
     home = js_home()
     if not (home / "node_modules/@tensorflow/tfjs").is_dir():
         pytest.skip("@tensorflow/tfjs is not here: make install")
     (tmp_path / "node_modules").symlink_to((home / "node_modules").resolve())
+    for package in PACKAGES:
+        place = tmp_path / "cdn" / f"{package.name}@{package.version}"
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.symlink_to((home / "node_modules" / package.name).resolve())
     (tmp_path / "recurrent").symlink_to(out / "recurrent")
-    page = code_of(out, "recurrent", target)
     tell = "(what) => navigator.sendBeacon('/told', JSON.stringify(what))"
     told = f"<script>const tell = {tell}; let logs = 0; onerror = (m) => tell('error: ' + m);"
     told += "const shown = () => tell(document.getElementById('answer').textContent);"
     told += "console.log = (...v) => { tell(v); if (++logs === 3) setTimeout(shown, 500); };"
     told += "onunhandledrejection = (e) => tell('error: ' + e.reason);</script>"
+    page = page.replace('<script type="module">', '<script type="module" onerror="tell(\'not loaded\')">')
     (tmp_path / "index.html").write_text(page.replace('<meta charset="utf-8">', f'<meta charset="utf-8">{told}'))
     answers: queue.Queue[Any] = queue.Queue()
 
@@ -271,35 +309,33 @@ def test_a_page_runs_in_a_browser(target: str, out: Path, tmp_path: Path) -> Non
             stderr=subprocess.DEVNULL,
         )
         try:
-            *logged, shown = [answers.get(timeout=600) for _ in range(4)]
+            return [answers.get(timeout=600) for _ in range(count)]
         finally:
             browser.kill()
             browser.wait()
             server.shutdown()
-    for (values,) in logged:
-        assert np.size(values) == 2, logged
-    # The page posts them side by side, so they may arrive in another order.
-    assert sorted(json.loads(line) for line in shown.splitlines()) == sorted(values for (values,) in logged)
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("target", ["policy-node", "policy-ort-node", "tfjs-node", "onnxruntime-web-node"])
 @pytest.mark.parametrize("name", ["recurrent", "continuous"])
-def test_node_runs_what_is_printed_for_it(name: str, out: Path, tmp_path: Path) -> None:
+def test_node_runs_what_is_printed_for_it(name: str, target: str, out: Path, tmp_path: Path) -> None:
     """As it is printed, with paths: nothing is fetched."""
     node, home = node_executable(), js_home()
     if node is None or not (home / "node_modules/@tensorflow/tfjs").is_dir():
         pytest.skip("Node or @tensorflow/tfjs is not here: make install")
     (tmp_path / "node_modules").symlink_to((home / "node_modules").resolve())
     shutil.copytree(out / name, tmp_path / name)
-    (tmp_path / "play.mjs").write_text(code_of(out, name, "policy-node"), encoding="utf-8")
+    (tmp_path / "play.mjs").write_text(code_of(out, name, target), encoding="utf-8")
     done = subprocess.run([node, "play.mjs"], cwd=tmp_path, capture_output=True, encoding="utf-8", timeout=300)
     assert done.returncode == 0, done.stderr[-2000:]
-    agents = load_policy(out / name, runtime="numpy", seed=0).agent()
+    agents = load_policy(out / name, runtime="numpy", seed=0).agent(deterministic=not target.startswith("policy"))
     zeros = {s.name: np.zeros([n or 1 for n in s.shape], s.dtype) for s in agents.policy.signature.observations}
     lines = [line for line in done.stdout.splitlines() if line.startswith("[")]
     assert len(lines) == (3 if name == "recurrent" else 1)
     for line in lines:
-        np.testing.assert_allclose(json.loads(line), agents.decide(zeros).action, atol=1e-5, rtol=1e-5)
+        expected = agents.decide(zeros).action
+        np.testing.assert_allclose(np.reshape(json.loads(line), expected.shape), expected, atol=1e-5, rtol=1e-5)
 
 
 # ------------------------------------------------------------------ C#, Unity, shell
