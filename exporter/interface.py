@@ -24,6 +24,7 @@ from exporter.play.play import play_policy
 from exporter.play.report import PlayReport
 from exporter.play.worlds import MakeWorld
 from exporter.remote.fetching import nearby
+from exporter.tables import count_text
 from exporter.verify.options import VerifyOptions
 from exporter.verify.report import ParityReport
 from signatures.code import code_options
@@ -95,7 +96,7 @@ def export(
     failed = [r for r in results if r.passed is False]
     if failed and strict:
         raise ParityError(
-            f"{len(failed)} of {len(results)} policies do not agree in all formats",
+            f"{len(failed)} of {count_text(len(results), 'policy', 'policies')} failed: the formats disagree",
             report=[r.report.to_dict() for r in failed if r.report is not None],
             where=str(failed[0].folder),
             fix="parity.json in that folder names the outputs, runtimes and inputs",

@@ -1,4 +1,4 @@
-"""A file of settings that a user wrote, TOML or JSON: read within bounds, since it may be a stranger's."""
+"""A file of settings that a user wrote, TOML or JSON: read within bounds, since it is untrusted."""
 
 from __future__ import annotations
 

@@ -262,7 +262,7 @@ def _check_sizes(whole: Field, inputs: tuple[TensorSpec, ...]) -> None:
 
 
 def _check_branches(whole: Field, key: str, specs: tuple[TensorSpec, ...]) -> None:
-    """Raise FieldError where masks, or chances, are not one for each action of the branches."""
+    """Raise FieldError unless masks and probabilities have one entry per action."""
     total = sum(n.value for n in whole["branches"].items())
     for entry, spec in zip(whole[key].items(), specs, strict=True):
         if spec.role in (Role.MASKS, Role.LOG_PROBS, Role.PROBS) and total and spec.shape[-1] not in (None, total):

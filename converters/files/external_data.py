@@ -1,4 +1,4 @@
-"""Large contents kept out of protobuf messages, in which a mark stands for each.
+"""Keeps large tensors out of protobuf messages; a placeholder marks each.
 
 protobuf copies what it parses, what is taken out of a message, what one message is given of another, and all of it
 again to serialise it: a graph of 200 MB was some gigabytes. With its weights detached it has some kilobytes. A reader

@@ -89,7 +89,7 @@ def read_bytes(path: Path, *, empty: bool = False, most: int = MAX_BYTES) -> byt
 
 
 def open_regular_file(path: Path, most: int = MAX_BYTES) -> BinaryIO:
-    """A file that was written, open to be read: no pipe, device or folder, no circle of links, and not mostly a hole.
+    """Open a regular file for reading: not a pipe, device, folder, symlink loop or mostly sparse file.
 
     Raises SourceError, too where it has more than ``most`` bytes.
     """

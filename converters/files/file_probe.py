@@ -88,7 +88,7 @@ class Content:
 
 
 def json_in(data: bytes | str) -> Any:
-    """What JSON text of a stranger says. Raises ValueError, too where a text in it is none or there are too many
+    """Parse untrusted JSON text. Raises ValueError, too where a text in it is none or there are too many
     values, and RecursionError.
     """
     text = data if isinstance(data, str) else data.decode("utf-8-sig")

@@ -1,4 +1,4 @@
-"""A stranger's ZIP archive: entries that every reader would find alike, and no more bytes than were asked for.
+"""Reading untrusted ZIP archives: entries that every reader would find alike, and no more bytes than were asked for.
 
 Names that stand there twice mean one file to us and another to the program that is meant; a link means a file
 elsewhere; bzip2 and LZMA unfold some bytes to gigabytes in one step, which zipfile does not bound.

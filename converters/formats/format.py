@@ -149,7 +149,7 @@ class Code:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Format:
-    """A form in which policies are given, written or both. What it has not is None or empty.
+    """A form in which policies are given, written or both. Unsupported features are None or empty.
 
     - ``key`` is its one name, ``label`` what people call it, ``advice`` what to do where it cannot be read.
     - ``sniff`` looks at a file's content. ``marker`` is the file that makes a folder one of this format; ``at`` says

@@ -69,7 +69,7 @@ class Builder:
     def named_input(
         self, name: str, dtype: np.dtype[Any], dims: Sequence[int | None], origin: str | tuple[str, ...] | None = None
     ) -> str:
-        """An input, called as it is said; None stands for a free length."""
+        """A named placeholder; None marks a dynamic axis."""
         attrs = {"dtype": dtype, "shape": TensorShape(tuple(dims))}
         return self.append(Node(name, "Placeholder", attrs=attrs, origin=origin))
 

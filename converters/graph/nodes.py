@@ -286,7 +286,7 @@ def _is_ordered(nodes: Sequence[Node]) -> bool:
     return True
 
 
-#: Characters of a name that is made here. A stranger's layer of a megabyte's name would hand it to all of its nodes.
+#: Characters of a name that is made here: an untrusted name of a megabyte would go to all nodes made of its layer.
 MAX_NAME = 1 << 10
 
 

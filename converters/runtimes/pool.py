@@ -66,7 +66,7 @@ class RuntimePool(AbstractContextManager["RuntimePool"]):
     def __init__(self, commands: Mapping[str, Callable[[], list[str]]] = _COMMANDS) -> None:
         self._commands = commands
         self._processes: dict[str, RuntimeProcess] = {}
-        self._endless: set[str] = set()
+        self._timed_out: set[str] = set()
 
     def start(self, names: Iterable[str]) -> None:
         """Start these runtimes' processes side by side; ``process`` waits for one, when it is needed.
@@ -85,7 +85,7 @@ class RuntimePool(AbstractContextManager["RuntimePool"]):
     def _launch(self, name: str) -> RuntimeProcess:
         if name not in self._processes:
             self._processes[name] = RuntimeProcess(
-                name, self._commands[name](), confined=name not in _FREE, endless=self._endless
+                name, self._commands[name](), confined=name not in _FREE, timed_out=self._timed_out
             )
         self._processes[name].launch()
         return self._processes[name]

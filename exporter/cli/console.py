@@ -118,7 +118,7 @@ class Console:
 
     # ---- results, for people
 
-    def result(self, result: ExportResult) -> None:
+    def print_result(self, result: ExportResult) -> None:
         """One policy that was exported."""
         if self._silent or (self.quiet and result.passed is not False):
             return
@@ -177,7 +177,7 @@ class Console:
             say_paragraph(missing)
         say_paragraph(report.sentence, colour=_colour([report]))
 
-    def whole(self, reports: Sequence[ParityReport], refused: int = 0) -> None:
+    def print_summary(self, reports: Sequence[ParityReport], refused: int = 0) -> None:
         """What came of several policies, in one line; ``refused`` sources or bundles were."""
         if len(reports) + refused < 2 or self._silent or (self.quiet and all(r.passed is not False for r in reports)):
             return

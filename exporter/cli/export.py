@@ -169,8 +169,8 @@ def export_command(
         for result in export(list(sources), job, progress, refused=refuse):
             results.append(result)
             progress.clear()
-            console.result(result)
-    console.whole([r.report for r in results if r.report is not None], refused=len(refused))
+            console.print_result(result)
+    console.print_summary([r.report for r in results if r.report is not None], refused=len(refused))
     played: list[PlayReport] = [] if env is None else _play(env, sources[0], results, job, console)
     told: dict[str, object] = {"refused": [e.to_dict() for e in refused]} if refused else {}
     told |= {"play": [p.to_dict() for p in played]} if played else {}

@@ -77,9 +77,9 @@ def _clean_up() -> None:
 
 def _run(args: list[str]) -> None:
     from exporter.cli.streams import whole_streams
-    from signatures.cycles import look_seldom
+    from signatures.cycles import raise_gc_threshold
 
-    look_seldom()  # before the imports, which are a good part of an export
+    raise_gc_threshold()  # before the imports, which are a good part of an export
     with whole_streams():
         _command(args)
 

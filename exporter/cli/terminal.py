@@ -1,4 +1,4 @@
-"""The one way to the terminal: what a stranger's file is called, or says, cannot act there. Imports click only.
+"""The one way to the terminal: what an untrusted file is called, or says, cannot act there. Imports click only.
 
 A terminal obeys control characters (colours, the title, the clipboard by OSC 52), and writes backwards where it is told
 so. What cannot be printed is replaced in every text of the commands; only our own colours pass, and the line ends of

@@ -119,7 +119,7 @@ def verify_command(
             verified.append((folder, address))
             progress.clear()
             console.report_policy(report, folder)
-        console.whole(reports, refused=len(refused))
+        console.print_summary(reports, refused=len(refused))
         console.check_rules(reports)
         told = {"refused": [e.to_dict() for e in refused]} if refused else {}
         console.json({"reports": [r.to_dict() for r in reports], **told})

@@ -86,7 +86,7 @@ class _Candidate:
     drawn: frozenset[str]
     problems: tuple[_Problem, ...]
     #: outputs that export-model made for the reference, and that this one has none of
-    spared: tuple[str, ...] = ()
+    missing_ok: tuple[str, ...] = ()
 
     def own_feeds(self, feeds: Feeds) -> dict[str, np.ndarray]:
         """What it is fed, by its own names, for the reference's inputs."""
@@ -174,7 +174,7 @@ def compare_artefacts(
             else:
                 reports.append(compare_rounded(tested, policy, storage, folder, compared, used, pool, options))
         report = merge_reports(reports)
-    notes = [f"not compared, as {m.label} never had it: {', '.join(m.spared)}" for m in matched if m.spared]
+    notes = [f"not compared, as {m.label} never had it: {', '.join(m.missing_ok)}" for m in matched if m.missing_ok]
     report = replace(report, notes=(*report.notes, *notes))
     if report.passed is None and not report.undecided and not (allow_unverified or runtimes == "none"):
         raise RuntimeUnavailableError(
@@ -316,9 +316,9 @@ def _match(
     noise = frozenset(s.name for s in lacking if s.role is Role.NOISE)
     drawn = frozenset(policy.graph.descendants(noise).intersection(found))
     # What was made for the reference may be missing where all of it is: then the candidate is of another maker.
-    spared = tuple(sorted(made - set(found))) if found and not made & set(found) else ()
+    missing_ok = tuple(sorted(made - set(found))) if found and not made & set(found) else ()
     for spec in signature.outputs:
-        if spec.name not in found and spec.name not in spared:
+        if spec.name not in found and spec.name not in missing_ok:
             text = f"missing output {aliases[spec.name][0]!r}; there are {_names(own.outputs)}"
             problems.append(_Problem(spec.name, text))
     needed = policy.graph.ancestors(found)
@@ -336,7 +336,7 @@ def _match(
             text = f"it takes an input {port.name!r} that is not in the reference"
             problems.append(_Problem(port.name, text, blocking=True))
     outputs = {n: p.name for n, p in found.items()}
-    return _Candidate(label, kind, own, inputs, outputs, constant, drawn, tuple(problems), spared)
+    return _Candidate(label, kind, own, inputs, outputs, constant, drawn, tuple(problems), missing_ok)
 
 
 def _names(ports: Sequence[Port]) -> str:

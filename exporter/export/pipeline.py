@@ -34,6 +34,7 @@ from exporter.export.sources import Source, read_source
 from exporter.remote.fetching import name_address, nearby
 from exporter.remote.filesystem import remote
 from exporter.remote.sending import check_free, check_sendable, landing
+from exporter.tables import count_text
 from exporter.verify.checks.size import check_budget
 from exporter.verify.tolerances import check_rules
 from signatures.contract import PARITY, Contract, safe_name
@@ -357,7 +358,7 @@ def join_reports(
     what: str = "the policy under its own names, from which this was made",
 ) -> ParityReport:
     """The report of a policy, with what came of the one that it was made from."""
-    said = own.verdict if own.passed is not None else f"{len(own.comparisons)} comparisons passed"
+    said = own.verdict if own.passed is not None else f"{count_text(len(own.comparisons), 'comparison')} passed"
     note = f"{what}: {said}, against {own.reference}"
     passed = False if own.passed is False else report.passed
     comparisons, notes = (*report.comparisons, *own.failures), (*report.notes, note)

@@ -50,7 +50,7 @@ class Run:
 # ------------------------------------------------------------------ on a worker
 
 
-class _Station:
+class _WorkerState:
     """What a worker keeps from task to task: runtimes that have started, and sources that wait for their names."""
 
     def __init__(self, run: Run) -> None:
@@ -63,7 +63,7 @@ class _Station:
         self.ended = False
 
     @contextlib.contextmanager
-    def turn(self) -> Iterator[None]:
+    def locked(self) -> Iterator[None]:
         """A source's; a run that ended meanwhile is closed after it."""
         try:
             with self.lock:
@@ -92,8 +92,8 @@ class _Station:
 class _Working:
     """A source in a thread of its own, which rests while its names are not known."""
 
-    def __init__(self, station: _Station, path: Path) -> None:
-        self.station, self.path = station, path
+    def __init__(self, state: _WorkerState, path: Path) -> None:
+        self.state, self.path = state, path
         self.said: SimpleQueue[Claim | Outcome] = SimpleQueue()
         self.answers: SimpleQueue[list[Claimed] | None] = SimpleQueue()
         threading.Thread(target=self._work, daemon=True).start()
@@ -107,9 +107,9 @@ class _Working:
         return answer
 
     def _work(self) -> None:
-        station = self.station
+        state = self.state
         try:
-            self.said.put(export_source(station.exporter, self.path, self, station.pool, station.run.wanted))
+            self.said.put(export_source(state.exporter, self.path, self, state.pool, state.run.wanted))
         except BaseException as error:
             self.said.put(
                 Outcome(self.path, error=SourceError("was not exported", where=path_text(self.path), why=repr(error)))
@@ -117,42 +117,42 @@ class _Working:
             raise
 
 
-_stations: dict[str, _Station] = {}
+_states: dict[str, _WorkerState] = {}
 _entering = threading.Lock()
 
 
-def _station(run: Run) -> _Station:
+def _state_of(run: Run) -> _WorkerState:
     with _entering:
-        if run.identity not in _stations:
-            for identity, other in list(_stations.items()):
+        if run.identity not in _states:
+            for identity, other in list(_states.items()):
                 if time.monotonic() - other.used > _FORGOTTEN and not other.lock.locked():
-                    _stations.pop(identity).end()
-            _stations[run.identity] = _Station(run)
-        station = _stations[run.identity]
-        station.used = time.monotonic()
-        return station
+                    _states.pop(identity).end()
+            _states[run.identity] = _WorkerState(run)
+        state = _states[run.identity]
+        state.used = time.monotonic()
+        return state
 
 
-def ask(run: Run, path: Path) -> tuple[str, Claim | Outcome]:
+def compile_task(run: Run, path: Path) -> tuple[str, Claim | Outcome]:
     """The worker's address, and what a source asks for; or its outcome, where it came to no names."""
     from distributed import get_worker
 
-    station = _station(run)
-    with station.turn():
-        working = _Working(station, path)
+    state = _state_of(run)
+    with state.locked():
+        working = _Working(state, path)
         said = working.said.get()
         if isinstance(said, Claim):
-            station.waiting[path] = working
+            state.waiting[path] = working
         return get_worker().address, said
 
 
-def answer(run: Run, path: Path, names: list[Claimed]) -> Outcome:
+def finish_task(run: Run, path: Path, names: list[Claimed]) -> Outcome:
     """The outcome of a source under these names; from its beginning where it does not wait for them here."""
-    station = _station(run)
-    with station.turn():
-        working = station.waiting.pop(path, None)
+    state = _state_of(run)
+    with state.locked():
+        working = state.waiting.pop(path, None)
         if working is None:
-            working = _Working(station, path)
+            working = _Working(state, path)
             said = working.said.get()
             if isinstance(said, Outcome):
                 return said
@@ -162,12 +162,12 @@ def answer(run: Run, path: Path, names: list[Claimed]) -> Outcome:
         return said
 
 
-def leave(identity: str) -> None:
+def shutdown(identity: str) -> None:
     """End what a worker keeps of a run."""
     with _entering:
-        station = _stations.pop(identity, None)
-    if station is not None:
-        station.end()
+        state = _states.pop(identity, None)
+    if state is not None:
+        state.end()
 
 
 def program_version() -> str:
@@ -199,7 +199,7 @@ class Cluster:
             # One that is lost is asked for nothing: an answer would be waited for.
             with contextlib.suppress(OSError, CancelledError):
                 if client.status == "running":
-                    client.run(leave, run.identity, on_error="ignore")
+                    client.run(shutdown, run.identity, on_error="ignore")
             client.close()
 
     def _outcomes(self, client: Any, run: Run) -> Iterator[Outcome]:
@@ -218,7 +218,7 @@ class Cluster:
             done.add(future)
 
         for _, number in zip(range(_AHEAD * sum(client.nthreads().values())), todo, strict=False):
-            submit(number, ask)
+            submit(number, compile_task)
         for future in done:
             number = index.pop(future.key)
             worker, said = self._result_of(future, number)
@@ -227,10 +227,10 @@ class Cluster:
             else:
                 self.turns.ends(number)
                 if (following := next(todo, None)) is not None:
-                    submit(following, ask)
+                    submit(following, compile_task)
                 yield replace(said, path=self.paths[number])
             for named, where, names in self.turns.answers():
-                submit(named, answer, names, workers=[where], allow_other_workers=True)
+                submit(named, finish_task, names, workers=[where], allow_other_workers=True)
 
     def _result_of(self, future: Any, number: int) -> tuple[str, Claim | Outcome]:
         try:

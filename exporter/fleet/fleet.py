@@ -90,7 +90,7 @@ def _here(exporter: Exporter, paths: Sequence[Path], names: Names, wanted: Wante
 
 @contextmanager
 def _no_modules_of_this_folder() -> Iterator[None]:
-    """What multiprocessing starts is ``python -c``, which looks first where the user stands: at a stranger's, maybe."""
+    """What multiprocessing starts is ``python -c``, which looks first where the user stands: which may be untrusted."""
     before = os.environ.get(_SAFE_PATH)
     os.environ[_SAFE_PATH] = "1"
     try:

@@ -1,4 +1,4 @@
-"""What tells a line that this user's export-model wrote from one that came with a stranger's folder.
+"""What tells a line that this user's export-model wrote from one that came with an untrusted folder.
 
 A folder of bundles travels: it is downloaded, or lies in a repository that CI checks out. A line which says that a
 source was exported and verified would be believed of whoever wrote it. So each line carries a mark, an HMAC-SHA256

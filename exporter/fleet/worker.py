@@ -18,7 +18,7 @@ from exporter.export.options import ExportOptions
 from exporter.export.pipeline import Exporter, ExportResult, near
 from exporter.fleet.ledger import Stamp, State, stamps, state
 from exporter.reports.entry import Entry, of_result
-from signatures.cycles import look_seldom
+from signatures.cycles import raise_gc_threshold
 from signatures.errors import ExportModelError, RefusedError, SourceError
 from signatures.records import dataclass
 
@@ -129,7 +129,7 @@ class _Asking:
 def work(pipe: Connection, options: ExportOptions, wanted: Wanted) -> None:
     """Take sources from the pipe until it says None; what they need is set up once. The program of a worker."""
     end_with_parent()
-    look_seldom()
+    raise_gc_threshold()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches every process; the first one decides
     if hasattr(signal, "SIGHUP"):
         signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as a terminal does that is closed

@@ -20,7 +20,7 @@ from converters.policy.policy import Policy
 from converters.policy.rules import Decision
 from exporter.export.sources import read_source
 from exporter.reports.layers import blocks_of, chain
-from exporter.tables import paragraph, size_text, table
+from exporter.tables import count_text, paragraph, size_text, table
 from signatures.contract import safe_name
 from signatures.errors import ExportModelError, naming
 from signatures.fields import printable
@@ -192,8 +192,8 @@ def _refusal(path: Path, policy: Policy, target: Format) -> str | None:
 def inspection_text(inspection: Inspection) -> str:
     """For the terminal."""
     head = (
-        f"{inspection.path}: {inspection.kind}, {size_text(inspection.size)}, {inspection.nodes} nodes, "
-        f"{len(inspection.policies)} {'policy' if len(inspection.policies) == 1 else 'policies'}"
+        f"{inspection.path}: {inspection.kind}, {size_text(inspection.size)}, {count_text(inspection.nodes, 'node')}, "
+        f"{count_text(len(inspection.policies), 'policy', 'policies')}"
         + (f"; {inspection.producer}" if inspection.producer else "")
     )
     return "\n\n".join([paragraph(head, "", "  "), *(_policy_text(p) for p in inspection.policies)])

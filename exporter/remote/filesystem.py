@@ -2,7 +2,7 @@
 
 Only what is named in ``FETCHED`` is asked for: fsspec also knows protocols that read this machine's files (``file``,
 ``local``, ``dir``), run what they are told (``reference``, ``dask``), or stand in front of others
-(``simplecache::``, ``zip::``), and a list of addresses may be a stranger's.
+(``simplecache::``, ``zip::``), and a list of addresses may be untrusted.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from exporter.reports import charts
 from exporter.reports.entry import Entry
 from exporter.reports.layers import blocks_of
 from exporter.reports.markup import Child, Markup, el
-from exporter.tables import command_text, size_with_original
+from exporter.tables import command_text, count_text, size_with_original
 from exporter.verify.findings import Failure, Finding, Rollout
 from signatures.spec import TensorSpec
 
@@ -204,7 +204,7 @@ def policy_graph(entry: Entry) -> Markup | None:
         content.append(el("p", f"{len(nodes)} nodes: too many for a picture.", class_="soft"))
     rows = [(el("code", n.name), n.op, _wide(el("code", ", ".join(n.inputs)))) for n in nodes[:_MOST_NODES]]
     listing = table("Nodes in the order they are computed, constants left out", ("node", "op", "inputs"), rows)
-    content.append(el("details", el("summary", f"All {len(nodes)} nodes"), listing))
+    content.append(el("details", el("summary", f"All {count_text(len(nodes), 'node')}"), listing))
     return section("The policy", content)
 
 

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Sequence
 
 from converters.formats.registry import WRITTEN
-from exporter.tables import size_with_original, table
+from exporter.tables import count_text, size_with_original, table
 from exporter.verify.findings import Finding, Undecided
 from exporter.verify.report import ParityReport
 from exporter.verify.verdict import key_of, missing_runtimes
@@ -92,6 +92,5 @@ def whole_summary(reports: Sequence[ParityReport], refused: int = 0) -> str:
         most = f"; at most {worst[0].cell()} of the tolerance: {worst[0].output} of {worst[1]}, {worst[0].where}"
     partial = sum(r.partial for r in reports)
     some = f"; {partial} in part: not every format was checked" if partial else ""
-    what = "policy" if len(reports) == 1 else "policies"
-    told = [f"{len(reports)} {what}: {said}{named}{some}{most}"] if reports else []
+    told = [f"{count_text(len(reports), 'policy', 'policies')}: {said}{named}{some}{most}"] if reports else []
     return "; ".join([*told, *([f"{refused} REFUSED"] if refused else [])])

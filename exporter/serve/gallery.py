@@ -15,6 +15,7 @@ from exporter import __version__
 from exporter.serve.scenes import other_side, scene_of
 from exporter.serve.server import INDEX
 from exporter.serve.site import MADE_BY, PAGE, SITE, assemble, assemble_one_file
+from exporter.tables import count_text
 from signatures.errors import BundleError, ExportModelError
 from signatures.records import dataclass
 
@@ -104,7 +105,7 @@ def assemble_gallery(folders: Sequence[Path], *, whole: bool) -> Gallery:
         raise left_out[0] if left_out else BundleError("no bundle was given", fix="export-model SOURCE -o exported")
     first = next((path for path in sorted(files) if path.startswith("pictures/")), None)
     image = "" if first is None else f'<meta property="og:image" content="{first}">\n'
-    title = f"{len(shown)} {'policy' if len(shown) == 1 else 'policies'}"
+    title = count_text(len(shown), "policy", "policies")
     files[INDEX] = _PAGE.format(title=title, text=_TEXT, image=image, cards="\n".join(cards)).encode()
     files[SITE] = dumps({"made_by": MADE_BY, "version": __version__, "gallery": shown})
     return Gallery(files, tuple(shown), tuple(left_out))

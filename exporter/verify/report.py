@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import field, replace
 from typing import Any
 
+from exporter.tables import count_text
 from exporter.verify.findings import Accepted, Failure, Finding, Played, Shape, Undecided
 from exporter.verify.verdict import unchecked_formats, verdict
 from signatures.records import dataclass
@@ -86,7 +87,7 @@ class ParityReport:
     original: str | None = None
 
     def __repr__(self) -> str:
-        return f"<ParityReport {self.policy!r} {self.verdict}: {len(self.comparisons)} comparisons{self._worst}>"
+        return f"<ParityReport {self.policy!r} {self.verdict}: {count_text(len(self.comparisons), 'comparison')}{self._worst}>"
 
     def _repr_html_(self) -> str:
         from exporter.reports.markup import notebook

@@ -30,8 +30,8 @@ from signatures.roles import Role
 from signatures.sampling import FAR_CASES, Case, draw_cases, draw_rollout, unknown_ids
 
 Arrays = dict[str, np.ndarray]
-#: A difference so many times what rounding explained is not explained by looking longer.
-_HOPELESS = 8
+#: Give up above this multiple of the rounding bound.
+_GIVE_UP_FACTOR = 8
 #: Outputs that an argmax is taken of.
 _SCORES = (Role.LOG_PROBS, Role.PROBS, Role.Q_VALUES)
 
@@ -138,7 +138,7 @@ class Trial:
         if not explained.passed and (settled := self._broken_ties(name, expected, got, participant, at)) is not None:
             expected = {**expected, name: settled}
             explained = self._compare(name, expected, got, participant, rounding)
-        far = {n: _HOPELESS * a for n, a in rounding.items()}
+        far = {n: _GIVE_UP_FACTOR * a for n, a in rounding.items()}
         if explained.passed or not self._compare(name, expected, got, participant, far).passed:
             return explained
         return self._compare(name, expected, got, participant, self._rounding_bounds(at, participant, sure=True))

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from converters.formats.registry import WRITTEN
 from converters.runtimes.pool import INDEPENDENT
+from exporter.tables import count_text
 from exporter.verify.findings import Accepted, Decisions, Draws, Failure, Finding, Played, Size, Undecided
 
 if TYPE_CHECKING:
@@ -182,7 +183,9 @@ def _wrong(report: ParityReport) -> list[str]:
     told = []
     if measured:
         count = sum(not isinstance(c, Accepted | Decisions | Failure | Size) for c in report.comparisons)
-        told.append(f"{len(measured)} of {count} comparisons disagree with {reference_text(report)}{_alone(report)}")
+        told.append(
+            f"{len(measured)} of {count_text(count, 'comparison')} disagree with {reference_text(report)}{_alone(report)}"
+        )
     for kind, words in (
         (Failure, "no answer from {}"),
         (Decisions, "rounded weights decide otherwise: {}"),

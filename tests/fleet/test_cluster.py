@@ -121,29 +121,29 @@ def test_a_scheduler_that_ends(
 
 def test_two_runs_leave_each_other_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(distributed, "get_worker", lambda: SimpleNamespace(address="here"))
-    monkeypatch.setattr(fleet_cluster, "_stations", {})
+    monkeypatch.setattr(fleet_cluster, "_states", {})
     begun: list[Path] = []
     closed: list[str] = []
-    real, close = fleet_cluster.export_source, fleet_cluster._Station._close
+    real, close = fleet_cluster.export_source, fleet_cluster._WorkerState._close
 
     def counted(exporter: Any, path: Path, *more: Any) -> Outcome:
         begun.append(path)
         return real(exporter, path, *more)
 
     monkeypatch.setattr(fleet_cluster, "export_source", counted)
-    monkeypatch.setattr(fleet_cluster._Station, "_close", lambda s: (closed.append(s.run.identity), close(s)))
+    monkeypatch.setattr(fleet_cluster._WorkerState, "_close", lambda s: (closed.append(s.run.identity), close(s)))
     source = fixture("discrete")
     a, b, c = (fleet_cluster.Run(n, ExportOptions(tmp_path / n, verify="none"), Wanted()) for n in "abc")
     for run in (a, b):
-        assert isinstance(fleet_cluster.ask(run, source)[1], Claim)
+        assert isinstance(fleet_cluster.compile_task(run, source)[1], Claim)
     for run in (a, b):
-        assert fleet_cluster.answer(run, source, [("discrete", None)]).error is None
+        assert fleet_cluster.finish_task(run, source, [("discrete", None)]).error is None
     assert (len(begun), closed) == (2, [])
     monkeypatch.setattr(fleet_cluster, "_FORGOTTEN", -1)
-    with fleet_cluster._station(b).turn():  # it is at work
-        fleet_cluster._station(c)
+    with fleet_cluster._state_of(b).locked():  # it is at work
+        fleet_cluster._state_of(c)
         assert closed == ["a"]
-        fleet_cluster.leave("b")
+        fleet_cluster.shutdown("b")
         assert closed == ["a"]
     assert closed == ["a", "b"]
 

@@ -1,4 +1,4 @@
-"""What is done to each part of a concatenation is done once, to all of it.
+"""Batches identical per-branch ops into one op on the concatenation.
 
 A discrete policy treats each of its branches alike: scores, a softmax, masks, a division by the sum, a logarithm; then
 puts them side by side. In runtimes in which the start of an op is most of its cost, ops on all branches at once cost a

@@ -15,7 +15,7 @@ from signatures.records import dataclass
 
 #: Class of a sensor by the number of its axes, where nobody names it.
 _CLASSES = {1: "VectorSensor", 2: "BufferSensor", 3: "CameraSensor"}
-#: Sensors and branches that an agent has, bytes of the file that says so: it may be a stranger's.
+#: Sensors and branches that an agent has, bytes of the file that says so: it is untrusted.
 _MOST, _MOST_BYTES = 1024, 1 << 20
 _ACTIONS = "continuous:2, discrete:3,2 or continuous:2+discrete:3"
 

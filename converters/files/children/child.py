@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, BinaryIO, NoReturn, Protocol
 
 from converters.files.children.frames import Tensors, read_frame, write_frame
-from signatures.cycles import look_seldom
+from signatures.cycles import raise_gc_threshold
 
 
 class Model(Protocol):
@@ -44,7 +44,7 @@ def claim_stdout() -> BinaryIO:
     The first call of a child: from here on it ends when its parent does.
     """
     end_with_parent()
-    look_seldom()
+    raise_gc_threshold()
     stream = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     return stream

@@ -46,12 +46,12 @@ class RuntimeProcess(AbstractContextManager["RuntimeProcess"]):
     """A child process that speaks frames. Started on first use, fed many models, ended by ``close``."""
 
     def __init__(
-        self, name: str, command: Sequence[str], *, confined: bool = True, endless: set[str] | None = None
+        self, name: str, command: Sequence[str], *, confined: bool = True, timed_out: set[str] | None = None
     ) -> None:
         """``confined``: it may not write outside a folder of its own, nor reach a network (confinement.py).
 
-        ``endless``: files that this or another runtime was stopped with, which are not loaded again; one that has no
-        end before its first answer is added. None where the models are no stranger's, or slow by themselves (Keras).
+        ``timed_out``: files that this or another runtime was stopped with, which are not loaded again; one that has no
+        end before its first answer is added. None where the models are trusted, or slow by themselves (Keras).
         """
         self.name = name
         self.command = list(command)
@@ -67,7 +67,7 @@ class RuntimeProcess(AbstractContextManager["RuntimeProcess"]):
         self._closed = threading.Event()
         self._memory: Memory | None = None
         self._loaded = 0
-        self._endless = endless
+        self._timed_out = timed_out
         #: the model that has not answered yet, the processor time at which the process is stopped, how much that gives
         self._first: tuple[str, float, float] | None = None
 
@@ -130,7 +130,7 @@ class RuntimeProcess(AbstractContextManager["RuntimeProcess"]):
         ``answered``: it did so once, and has the time of any request.
         """
         self.start()
-        if path in (self._endless or ()):
+        if path in (self._timed_out or ()):
             raise RunFailedError(f"not run in {self.name}", why="a runtime was stopped while it computed this file")
         self._loaded += 1
         identity = f"m{self._loaded}"
@@ -150,7 +150,7 @@ class RuntimeProcess(AbstractContextManager["RuntimeProcess"]):
     def first(self, path: str, size: int) -> Iterator[None]:
         """What is asked inside has little processor time (patience.py): a model is loaded, or answers once."""
         process = self._process
-        before = None if process is None or self._endless is None else processor_time(process.pid)
+        before = None if process is None or self._timed_out is None else processor_time(process.pid)
         self._first = None if before is None else (path, before + time_limit(size), time_limit(size))
         try:
             yield
@@ -196,7 +196,7 @@ class RuntimeProcess(AbstractContextManager["RuntimeProcess"]):
             status = _wait_or_kill(process)
             said = self._last_errors()
             self.close()
-            if self._first is not None and self._first[0] in (self._endless or ()):
+            if self._first is not None and self._first[0] in (self._timed_out or ()):
                 raise RunFailedError(
                     f"{self.name} was stopped: it did not come to an end",
                     why=f"to load this file, or answer its first input, {self._first[2]:.0f} s of computing are enough",
@@ -218,9 +218,9 @@ class RuntimeProcess(AbstractContextManager["RuntimeProcess"]):
         while not closed.wait(min(_LOOK, TIMEOUT)):
             if not self._busy:
                 continue
-            first, endless = self._first, self._endless
-            if first is not None and endless is not None and (processor_time(process.pid) or 0) > first[1]:
-                endless.add(first[0])
+            first, timed_out = self._first, self._timed_out
+            if first is not None and timed_out is not None and (processor_time(process.pid) or 0) > first[1]:
+                timed_out.add(first[0])
                 process.kill()
                 return
             if time.monotonic() - self._asked > TIMEOUT:

@@ -14,7 +14,7 @@ from pathlib import Path
 import converters
 
 #: Modules come from this very copy of the packages, installed or not, and none (-P) from the folder that the user
-#: stands in, where ``-c`` looks first: it may be a stranger's.
+#: stands in, where ``-c`` looks first: it may be untrusted.
 _PYTHON = (sys.executable, "-P", "-c")
 _PATH = f"import sys; sys.path.insert(0, {str(Path(converters.__file__).resolve().parent.parent)!r}); "
 

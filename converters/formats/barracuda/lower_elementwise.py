@@ -18,14 +18,16 @@ from converters.formats.barracuda.lower_values import Axes, Value, usual_axes
 from converters.formats.barracuda.vocabulary import COMPARISONS, ONE_OP, Activation, C, H, LayerType, W
 from converters.graph.types import Dim
 
-#: Those that a Barracuda of 1.0 lacks, or rounds another way.
-_YOUNG = frozenset(
+#: Activations that Barracuda lacks before 1.4, or rounds another way: decomposed.
+_UNSUPPORTED_BEFORE_1_4 = frozenset(
     (
         *(Activation.SOFTPLUS, Activation.SOFTSIGN, Activation.ROUND),
         *(Activation.COS, Activation.SIN, Activation.TAN, Activation.ERF),
     )
 )
-_ACTIVATIONS = {op: Activation(kind) for kind, op in ONE_OP.items() if kind not in _YOUNG} | {"Elu": Activation.ELU}
+_ACTIVATIONS = {op: Activation(kind) for kind, op in ONE_OP.items() if kind not in _UNSUPPORTED_BEFORE_1_4} | {
+    "Elu": Activation.ELU
+}
 _TWO: Mapping[str, LayerType] = {
     "Add": LayerType.ADD,
     "BiasAdd": LayerType.ADD,

@@ -43,8 +43,8 @@ def stored_in(path: Path) -> Stored:
             fix="pip install 'export-model[keras]'",
         )
     try:
-        # 20 kB can keep the HDF5 library busy for ever, so that reading has the processor time of any stranger's file.
-        with RuntimeProcess("h5py", child_command("converters.formats.keras.hdf5_child"), endless=set()) as process:
+        # 20 kB can keep the HDF5 library busy for ever, so that reading has the processor time of any untrusted file.
+        with RuntimeProcess("h5py", child_command("converters.formats.keras.hdf5_child"), timed_out=set()) as process:
             answer = process.load(str(path.absolute())).run({}, [])
     except RunFailedError as error:
         raise DamagedFileError(

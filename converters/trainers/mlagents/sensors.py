@@ -155,7 +155,7 @@ def find_sensors(
     if lengths:
         width -= state.length(f"{encoder}.rsa.fc_q.weight", 0)
     if told:
-        return _as_told(state, lists, modules, lengths, width, told), False
+        return _from_user(state, lists, modules, lengths, width, told), False
     if lengths:
         sizes = ", ".join(str(n) for n in lengths.values())
         raise SourceError(
@@ -335,7 +335,7 @@ def _channels(state: Weights, module: str, encoder: Encoder) -> int:
 # ------------------------------------------------------------------ as the user says
 
 
-def _as_told(
+def _from_user(
     state: Weights,
     lists: Sequence[str],
     modules: Sequence[str | None],

@@ -30,8 +30,6 @@ const view = {
   players: ["model"],
   observed: (observation) => observation,
   actions: ({ model }) => model,
-  // A ball that lasted 20 s went well.
-  score: { good: "balls kept up for 20 s", bad: "balls lost" },
   count: (tally) => `lost ${tally.bad}`,
   status(env, tally) {
     const longest = Math.max(...env.age) * TIME_STEP;

@@ -32,7 +32,6 @@ const view = {
   players: ["model"],
   observed: (observation) => observation,
   actions: ({ model }) => model,
-  score: { good: "walks of 20 s", bad: "falls" },
   count: (tally, env) => `${Math.max(...metres(env), 0).toFixed(0)} m, falls ${tally.bad}`,
   status(env, tally) {
     const farthest = Math.max(...metres(env), 0);

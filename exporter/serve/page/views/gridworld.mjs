@@ -20,7 +20,6 @@ const view = {
   players: ["model"],
   observed: (observation) => observation,
   actions: ({ model }) => model,
-  score: { good: "goals reached", bad: "episodes without a goal" },
   count: (tally) => `failed ${tally.bad}`,
   status: (env, tally) => `goals reached ${tally.good}`,
   describe(env, tally, chosen) {

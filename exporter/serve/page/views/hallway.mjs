@@ -24,7 +24,6 @@ const view = {
   players: ["model"],
   observed: (observation) => observation,
   actions: ({ model }) => model,
-  score: { good: "right doors", bad: "wrong doors, or none" },
   count: (tally) => `wrong or timed out ${tally.bad}`,
   status: (env, tally) => `correct ${tally.good}`,
   describe(env, tally, chosen) {

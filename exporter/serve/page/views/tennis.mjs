@@ -27,7 +27,6 @@ export function viewOf({ side, opponent }) {
       const [left, right] = side === "left" ? [model, theirs] : [theirs, model];
       return { discrete: left.discrete, continuous: right.continuous };
     },
-    score: { good: "points of 50 s", bad: "points that ended in a miss" },
     failed,
     count: (tally) => `missed ${failed(tally)}`,
     status(env, tally) {
