@@ -96,7 +96,7 @@ def export(
     failed = [r for r in results if r.passed is False]
     if failed and strict:
         raise ParityError(
-            f"{len(failed)} of {count_text(len(results), 'policy', 'policies')} failed: the formats disagree",
+            f"the formats of {len(failed)} of {count_text(len(results), 'policy', 'policies')} disagree",
             report=[r.report.to_dict() for r in failed if r.report is not None],
             where=str(failed[0].folder),
             fix="parity.json in that folder names the outputs, runtimes and inputs",

@@ -23,7 +23,7 @@ _SCENES = ("auto", "ball3d", "crawler2d", "gridworld", "hallway", "tennis", "non
     ("export-model serve 3DBall.onnx", "exported for the page"),
     ("export-model serve exported/3DBall -o page.html", "one file, to open or send"),
     ("export-model serve exported/3DBall -o site", "files for any web server"),
-    ("export-model serve exported -o gallery", "a page for each policy, and an index"),
+    ("export-model serve exported -o gallery", "a page each, and an index"),
 )
 @click.argument("bundle", type=PATH, metavar="BUNDLE|SOURCE")
 @click.option("--host", default="127.0.0.1", help="Address to listen on.")

@@ -63,7 +63,7 @@ class _WorkerState:
         self.ended = False
 
     @contextlib.contextmanager
-    def locked(self) -> Iterator[None]:
+    def hold_lock(self) -> Iterator[None]:
         """A source's; a run that ended meanwhile is closed after it."""
         try:
             with self.lock:
@@ -125,7 +125,7 @@ def _state_of(run: Run) -> _WorkerState:
     with _entering:
         if run.identity not in _states:
             for identity, other in list(_states.items()):
-                if time.monotonic() - other.used > _FORGOTTEN and not other.lock.locked():
+                if time.monotonic() - other.used > _FORGOTTEN and not other.lock.hold_lock():
                     _states.pop(identity).end()
             _states[run.identity] = _WorkerState(run)
         state = _states[run.identity]
@@ -138,7 +138,7 @@ def compile_task(run: Run, path: Path) -> tuple[str, Claim | Outcome]:
     from distributed import get_worker
 
     state = _state_of(run)
-    with state.locked():
+    with state.hold_lock():
         working = _Working(state, path)
         said = working.said.get()
         if isinstance(said, Claim):
@@ -149,7 +149,7 @@ def compile_task(run: Run, path: Path) -> tuple[str, Claim | Outcome]:
 def finish_task(run: Run, path: Path, names: list[Claimed]) -> Outcome:
     """The outcome of a source under these names; from its beginning where it does not wait for them here."""
     state = _state_of(run)
-    with state.locked():
+    with state.hold_lock():
         working = state.waiting.pop(path, None)
         if working is None:
             working = _Working(state, path)

@@ -87,7 +87,8 @@ class ParityReport:
     original: str | None = None
 
     def __repr__(self) -> str:
-        return f"<ParityReport {self.policy!r} {self.verdict}: {count_text(len(self.comparisons), 'comparison')}{self._worst}>"
+        compared = count_text(len(self.comparisons), "comparison")
+        return f"<ParityReport {self.policy!r} {self.verdict}: {compared}{self._worst}>"
 
     def _repr_html_(self) -> str:
         from exporter.reports.markup import notebook

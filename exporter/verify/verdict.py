@@ -183,9 +183,8 @@ def _wrong(report: ParityReport) -> list[str]:
     told = []
     if measured:
         count = sum(not isinstance(c, Accepted | Decisions | Failure | Size) for c in report.comparisons)
-        told.append(
-            f"{len(measured)} of {count_text(count, 'comparison')} disagree with {reference_text(report)}{_alone(report)}"
-        )
+        all_of = count_text(count, "comparison")
+        told.append(f"{len(measured)} of {all_of} disagree with {reference_text(report)}{_alone(report)}")
     for kind, words in (
         (Failure, "no answer from {}"),
         (Decisions, "rounded weights decide otherwise: {}"),

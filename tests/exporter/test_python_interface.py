@@ -188,7 +188,7 @@ def disagreeing(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("disagreeing")
 def test_a_disagreement_is_raised_after_everything_is_written(tmp_path: Path) -> None:
-    with pytest.raises(ParityError, match="1 of 1 policies do not agree") as caught:
+    with pytest.raises(ParityError, match="the formats of 1 of 1 policy disagree") as caught:
         export_model(BALL, tmp_path)
     assert caught.value.exit_status == 1
     assert caught.value.where == str(tmp_path / "continuous.failed")

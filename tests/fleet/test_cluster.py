@@ -140,7 +140,7 @@ def test_two_runs_leave_each_other_alone(tmp_path: Path, monkeypatch: pytest.Mon
         assert fleet_cluster.finish_task(run, source, [("discrete", None)]).error is None
     assert (len(begun), closed) == (2, [])
     monkeypatch.setattr(fleet_cluster, "_FORGOTTEN", -1)
-    with fleet_cluster._state_of(b).locked():  # it is at work
+    with fleet_cluster._state_of(b).hold_lock():  # it is at work
         fleet_cluster._state_of(c)
         assert closed == ["a"]
         fleet_cluster.shutdown("b")
