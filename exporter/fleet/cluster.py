@@ -125,7 +125,7 @@ def _state_of(run: Run) -> _WorkerState:
     with _entering:
         if run.identity not in _states:
             for identity, other in list(_states.items()):
-                if time.monotonic() - other.used > _FORGOTTEN and not other.lock.hold_lock():
+                if time.monotonic() - other.used > _FORGOTTEN and not other.lock.locked():
                     _states.pop(identity).end()
             _states[run.identity] = _WorkerState(run)
         state = _states[run.identity]
