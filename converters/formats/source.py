@@ -29,9 +29,9 @@ class OriginalRun:
     runtime: str
     path: Path
     options: Mapping[str, Any] = field(default_factory=dict)
-    definition: Any = field(default=None, repr=False, compare=False)
+    definition: Any = None
     #: what of the definition lies beside it
-    detached: Detached = field(default_factory=Detached, repr=False, compare=False)
+    detached: Detached = field(default_factory=Detached)
     #: the tensors that are asked for, and those that are fed: no more of the definition is run (None: all of it)
     asked: tuple[Collection[str], Collection[str]] | None = None
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,8 @@ from signatures.records import dataclass
 
 #: Attribute values: bool, int, float, str, bytes, numpy dtype, ``TensorShape``, ndarray, or a tuple of these.
 AttrValue = Any
+#: The types that a node read, what came of them, and the elements that were folded.
+Inferred = tuple[Sequence[TensorType], Sequence[TensorType], int]
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,10 +47,15 @@ class Node:
     attrs: Mapping[str, AttrValue] = field(default_factory=dict)
     value: np.ndarray | None = None
     origin: str | tuple[str, ...] | None = None
-    #: what ``shapes`` last inferred of it: the types that it read, what came of them, and the elements that were folded
-    inferred: tuple[Sequence[TensorType], Sequence[TensorType], int] | None = field(
-        init=False, repr=False, compare=False, default=None
-    )
+
+    @property
+    def inferred(self) -> Inferred | None:
+        """What ``shapes`` last inferred of it."""
+        return self.__dict__.get("_inferred")
+
+    def keep_inferred(self, inferred: Inferred | None) -> None:
+        """Keep what was inferred, beside the fields: it is not compared, and ``replace`` leaves it out."""
+        self.__dict__["_inferred"] = inferred
 
     @property
     def dims(self) -> tuple[int | None, ...] | None:
@@ -65,7 +73,7 @@ class Node:
         if fed == self.inputs and name == self.name:
             return self
         made = Node(name, self.op, fed, self.attrs, self.value, self.origin)
-        object.__setattr__(made, "inferred", self.inferred)
+        made.keep_inferred(self.inferred)
         return made
 
 
@@ -129,14 +137,23 @@ class Graph:
     """Nodes in topological order (the back edges of while loops apart), looked up by name."""
 
     nodes: tuple[Node, ...]
-    _index: dict[str, Node] = field(init=False, repr=False, compare=False)
-    #: what ``shapes.infer_types`` found, by its ``partial``: half of the passes ask for it
-    inferred: dict[bool, dict[str, TensorType]] = field(init=False, repr=False, compare=False, default_factory=dict)
-    #: what was made of it and may be asked for again: by who made it, and of what else
-    made: dict[Any, Any] = field(init=False, repr=False, compare=False, default_factory=dict)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "_index", by_name(self.nodes))
+        _ = self._index  # raises where two nodes share a name
+
+    @cached_property
+    def _index(self) -> dict[str, Node]:
+        return by_name(self.nodes)
+
+    @cached_property
+    def inferred(self) -> dict[bool, dict[str, TensorType]]:
+        """What ``shapes.infer_types`` found, by its ``partial``: half of the passes ask for it."""
+        return {}
+
+    @cached_property
+    def made(self) -> dict[Any, Any]:
+        """What was made of it and may be asked for again: by who made it, and of what else."""
+        return {}
 
     def __repr__(self) -> str:
         return f"<Graph of {len(self.nodes)} nodes>"

@@ -89,7 +89,7 @@ def _inferred_anew(
     made = symbols.count
     results = _results(op_of(node), node, args, symbols, allowance)
     if symbols.count == made and allowance.left >= 0:
-        object.__setattr__(node, "inferred", (args, results, _folded_elements(node, args, results)))
+        node.keep_inferred((args, results, _folded_elements(node, args, results)))
     return results
 
 

@@ -10,7 +10,7 @@ import multiprocessing
 import os
 import signal
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
@@ -128,7 +128,7 @@ class _Worker:
 
 
 @dataclass
-class _Crew(AbstractContextManager["_Crew"]):
+class _Crew:
     options: ExportOptions
     wanted: Wanted
     turns: Turns[_Worker]
@@ -212,6 +212,9 @@ class _Crew(AbstractContextManager["_Crew"]):
             worker.pipe.send(message)
         except OSError:  # it has ended, which the next wait tells
             return
+
+    def __enter__(self) -> _Crew:
+        return self
 
     def __exit__(self, *error: object) -> None:
         for worker in self.workers:

@@ -100,7 +100,7 @@ class Inspection:
     nodes: int
     policies: Sequence[PolicyInspection]
     #: (name, graph) of every model in it, as it was read
-    graphs: Sequence[tuple[str, Graph]] = field(default_factory=tuple, repr=False)
+    graphs: Sequence[tuple[str, Graph]] = ()
     #: what the file says of the tool that wrote it
     producer: str = ""
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, NoReturn
 
 import numpy as np
@@ -35,7 +36,6 @@ class Dressing:
 
     policy: Policy
     profile: str
-    builder: Builder = field(init=False)
     inputs: list[TensorSpec] = field(default_factory=list)
     outputs: list[TensorSpec] = field(default_factory=list)
     tensors: dict[str, str] = field(default_factory=dict)
@@ -51,8 +51,10 @@ class Dressing:
     #: what is taken from the scores of a forbidden action; by default as the torch exporter does it (0.22 on)
     forbidden: float = 1e8
 
-    def __post_init__(self) -> None:
-        self.builder = Builder(NameScope(n.name for n in self.policy.graph.nodes))
+    @cached_property
+    def builder(self) -> Builder:
+        """Builds the new graph, under names that the policy's own does not have."""
+        return Builder(NameScope(n.name for n in self.policy.graph.nodes))
 
     def refuse(self, what: str, *, why: str, fix: str) -> NoReturn:
         """Raise the ProfileError of what this profile cannot hold."""

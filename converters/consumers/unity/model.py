@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from typing import ClassVar
 
 import numpy as np
@@ -35,7 +35,7 @@ class InputView:
     last: int
 
 
-class CheckedModel(ABC):
+class CheckedModel:
     """An imported model. What raises says so: ``UnityThrows`` with the exception that Unity throws there."""
 
     #: What is called missing when nothing of that name is there.

@@ -53,7 +53,7 @@ class OnnxFile:
 
     model: Any
     beside: str = ""
-    _values: dict[str, np.ndarray | None] = field(default_factory=dict, repr=False)
+    _values: dict[str, np.ndarray | None] = field(default_factory=dict)
 
     @cached_property
     def initializers(self) -> Mapping[str, Any]:

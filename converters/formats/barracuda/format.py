@@ -111,7 +111,7 @@ class NnModel:
     outputs: tuple[str, ...]
     memories: tuple[NnMemory, ...]
     layers: tuple[Layer, ...]
-    weights: npt.NDArray[np.float32] = field(repr=False)
+    weights: npt.NDArray[np.float32]
     half: bool = False
     trailer: Trailer | None = None
 

@@ -59,7 +59,7 @@ class Bundle:
     folder: Path
     contract: Contract
     #: policy.json as it is, fields that are not known included
-    content: Mapping[str, Any] = field(repr=False)
+    content: Mapping[str, Any]
 
     @classmethod
     def open(cls, folder: Path) -> Bundle:

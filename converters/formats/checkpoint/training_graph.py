@@ -42,7 +42,7 @@ class TrainingGraph:
     graph: Graph
     saved: Mapping[str, Saved] = field(default_factory=dict)
     #: the GraphDef as it was read; None where there is none (a live session)
-    definition: Any = field(default=None, repr=False, compare=False)
+    definition: Any = None
 
 
 def read_training_graph(path: Path) -> TrainingGraph:

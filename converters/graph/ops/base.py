@@ -8,7 +8,6 @@ GraphDef, how other versions of TensorFlow spell it, and the *traits* that passe
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import KW_ONLY
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -154,15 +153,20 @@ class Attr:
 
 
 @dataclass(frozen=True, slots=True)
-class OpDef:
-    """One op of the table; see the module's docstring."""
+class _Entry:
+    """What an entry says in the order in which it says it; all else of an ``OpDef`` is named."""
 
     name: str
     infer: Infer
     kernel: Kernel | None = None
     onnx: Lower | None = None
     attrs: tuple[Attr, ...] = ()
-    _: KW_ONLY
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class OpDef(_Entry):
+    """One op of the table; see the module's docstring."""
+
     #: -1: as many as the node says.
     outputs: int = 1
     #: Folding is wrong for samplers and for matrix products (whose rounding depends on the processor).
