@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import field
 from pathlib import Path
+
+from msgspec import Struct, field
 
 from converters.compiler.options import CompileOptions, NoiseMode
 from converters.formats import source
 from exporter.export.labels import Labels
 from signatures.errors import UsageError
-from signatures.records import dataclass
 from signatures.roles import Role, parse_role
 
 _NOISE: Mapping[str, NoiseMode] = {"lift": "lift", "keep": "keep", "zero": "zero"}
 
 
-@dataclass(frozen=True, kw_only=True)
-class ReadOptions:
+class ReadOptions(Struct, frozen=True, kw_only=True):
     """How to read a source, where it does not say so itself."""
 
     #: A run's checkpoint (default: the newest).
@@ -47,8 +46,7 @@ class ReadOptions:
         return source.ReadOptions(self.step, sensors, self.trust_source, tuple(self.goals), self.activation, normaliser)
 
 
-@dataclass(frozen=True, kw_only=True)
-class WriteOptions:
+class WriteOptions(Struct, frozen=True, kw_only=True):
     """How to write a policy."""
 
     #: ``canonical`` tensor names, or the trainer's own: ``source``.

@@ -6,8 +6,9 @@ import math as numbers
 from collections.abc import Mapping
 from typing import Any
 
+from msgspec import Struct
+
 from signatures.errors import UsageError
-from signatures.records import dataclass
 
 #: Option → what it may say, the usual one first.
 CHOICES: Mapping[str, tuple[str, ...]] = {
@@ -17,8 +18,7 @@ CHOICES: Mapping[str, tuple[str, ...]] = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class CodeOptions:
+class CodeOptions(Struct, frozen=True):
     """What source code is asked for beside the policy.
 
     ``math``: the functions of the language's library, or our own, with the same bits on every processor. ``weights``:

@@ -11,18 +11,17 @@ import json
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import field
 from pathlib import PurePosixPath
 from typing import Any
 
 import numpy as np
+from msgspec import Struct, field
 
 from signatures.bounded import loads
 from signatures.code import CHOICES
 from signatures.fields import Field, FieldError, without_none
 from signatures.labels import parse_labels
 from signatures.memories import SourcePart
-from signatures.records import dataclass
 from signatures.roles import INPUT_ROLES, Constant, Role
 from signatures.spec import Memory, PolicySignature, SourceMap, TensorSpec, sources
 
@@ -55,16 +54,14 @@ _RANKS = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class FileEntry:
+class FileEntry(Struct, frozen=True):
     """One file of a bundle: the sha256 of its bytes (hexadecimal) and how many they are."""
 
     sha256: str
     size: int
 
 
-@dataclass(frozen=True, slots=True)
-class Origin:
+class Origin(Struct, frozen=True):
     """Where a policy comes from: the source's base name and sha256, which model of it, how it was read."""
 
     path: str
@@ -90,8 +87,7 @@ class Origin:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class Contract:
+class Contract(Struct, frozen=True):
     """What is agreed on a policy, the same in every format; ``files`` is empty in the copy that an artefact embeds."""
 
     name: str

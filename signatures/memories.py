@@ -7,12 +7,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
 
-from signatures.records import dataclass
 
-
-@dataclass(frozen=True, slots=True)
-class SourcePart:
+class SourcePart(Struct, frozen=True):
     """A tensor of the source that holds some columns of the memory [B, n]: ``shape`` has None where its batch is.
 
     PyTorch's states are [layers, B, hidden]; a row of them is layer after layer.
@@ -53,8 +51,7 @@ def join_memory(parts: Sequence[SourcePart], values: Mapping[str, np.ndarray]) -
     return np.concatenate([r.reshape(r.shape[0], -1) for r in rows], axis=1)
 
 
-@dataclass(frozen=True, slots=True)
-class SeparateMemory:
+class SeparateMemory(Struct, frozen=True):
     """One of several memories of a graph: the placeholder ``input`` is fed what the tensor ``output`` gave.
 
     ``taken`` and ``given`` are their shapes, None where the batch is. ``part`` is ``h`` or ``c``, empty where it is

@@ -14,11 +14,11 @@ from collections.abc import Callable, Sequence
 from typing import TypeAlias
 
 import numpy as np
+from msgspec import Struct
 
 from signatures.ids import id_bounds
 from signatures.masks import all_allowed, forbidden, one_allowed, random_masks
 from signatures.pictures import structured_images
-from signatures.records import dataclass
 from signatures.roles import OBSERVATIONS, Role
 from signatures.spec import PolicySignature, TensorSpec
 
@@ -49,8 +49,7 @@ _FREE_AXIS = 8
 _SPREAD_OF_INTEGERS = 3
 
 
-@dataclass(frozen=True, slots=True)
-class Case:
+class Case(Struct, frozen=True):
     """One set of inputs: its name in reports, the arrays by canonical name, and how many rows they have."""
 
     name: str

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import field
 from typing import Any
 
 import numpy as np
+from msgspec import Struct, field
 
 from signatures.memories import SourcePart
-from signatures.records import dataclass
 from signatures.roles import OBSERVATIONS, Constant, Role
 
 
-@dataclass(frozen=True, slots=True)
-class TensorSpec:
+class TensorSpec(Struct, frozen=True):
     """One input or output.
 
     ``shape`` has None for a free axis (the batch comes first). ``dtype`` is numpy's name. ``source`` is the tensor of
@@ -72,8 +70,7 @@ class TensorSpec:
         return self.role is Role.CONTINUOUS or (self.role is Role.DETERMINISTIC and self.dtype.startswith("float"))
 
 
-@dataclass(frozen=True, slots=True)
-class Memory:
+class Memory(Struct, frozen=True):
     """Recurrent state: ``size`` floats per agent, fed as ``input`` and read from ``output`` (None where the source
     has lost it). ``layout`` names its parts in order, for example ``("c", "h")``, or is empty where it is unknown.
     ``others`` are further (input, output) pairs of a memory in several tensors, a part of ``layout`` each.
@@ -91,8 +88,7 @@ class Memory:
         return {**entry, "others": [list(pair) for pair in self.others]} if self.others else entry
 
 
-@dataclass(frozen=True, slots=True)
-class ActionHead:
+class ActionHead(Struct, frozen=True):
     """An action: its output, the sizes of its branches (none: it is continuous), and the same without chance."""
 
     spec: TensorSpec
@@ -115,8 +111,7 @@ def _companion(head: TensorSpec, plain: Sequence[TensorSpec], heads: int) -> Ten
     return next((s for s in plain if heads == 1 or s.is_continuous == head.is_continuous), None)
 
 
-@dataclass(frozen=True, slots=True)
-class PolicySignature:
+class PolicySignature(Struct, frozen=True):
     """The contract of a policy, the same in every format it is written to."""
 
     inputs: tuple[TensorSpec, ...]
@@ -238,8 +233,7 @@ def _spec_named(specs: tuple[TensorSpec, ...], name: str) -> TensorSpec:
     raise KeyError(name)
 
 
-@dataclass(frozen=True, slots=True)
-class SourceMap:
+class SourceMap(Struct, frozen=True):
     """How to run the source itself: which of its tensors stand for the policy's inputs and outputs.
 
     - ``fixed``: placeholders that the policy no longer has, with the value they take.

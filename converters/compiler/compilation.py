@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import field, replace
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from converters.compiler.options import CompileOptions
 from converters.graph.nodes import Graph
@@ -11,15 +13,13 @@ from converters.policy.action import ActionMeaning
 from converters.policy.brains import Brain
 from converters.policy.facts import SourceFacts
 from signatures.memories import SourcePart
-from signatures.records import dataclass
 from signatures.roles import Role
 from signatures.spec import PolicySignature
 
 Dims = tuple[int | None, ...]
 
 
-@dataclass(frozen=True)
-class Compilation:
+class Compilation(Struct, frozen=True):
     """A brain's graph, and what is known of it so far; each pass returns a new one."""
 
     graph: Graph
@@ -62,8 +62,7 @@ Run = Callable[[Compilation], Compilation]
 Condition = Callable[[Compilation], str | None]
 
 
-@dataclass(frozen=True, slots=True)
-class Pass:
+class Pass(Struct, frozen=True):
     """A step of the compiler. The conditions are not checked in an export; tests check them around every pass."""
 
     name: str

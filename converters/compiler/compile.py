@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from msgspec.structs import replace
 
 from converters.compiler.compilation import Compilation, Pass, on_graph, on_inputs, on_tensors
 from converters.compiler.options import MAX_PORTS, CompileOptions

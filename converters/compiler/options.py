@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import field
 from typing import Literal
 
-from signatures.records import dataclass
+from msgspec import Struct, field
+
 from signatures.roles import Role
 
 #: A policy's placeholders, and its outputs.
@@ -15,8 +15,7 @@ MAX_PORTS = 1 << 10
 NoiseMode = Literal["lift", "keep", "zero"]
 
 
-@dataclass(frozen=True)
-class CompileOptions:
+class CompileOptions(Struct, frozen=True):
     """The fields are the flags of the command line."""
 
     names: str = "canonical"  # canonical | source

@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from functools import partial
 
+from msgspec import Struct
+
 from converters.compiler.passes.batch_branches import join_branches
 from converters.compiler.passes.clip_by_value import clip_by_value
 from converters.compiler.passes.constant_chains import merge_constants, share, square_differences
@@ -19,12 +21,10 @@ from converters.compiler.passes.lowering import lower_for_importers, lower_for_n
 from converters.compiler.passes.slice_of_concat import parts_for_slices
 from converters.graph.nodes import Graph
 from converters.policy.policy import Policy
-from signatures.records import dataclass
 from signatures.roles import Role
 
 
-@dataclass(frozen=True, slots=True)
-class Outputs:
+class Outputs(Struct, frozen=True):
     """Tensors that a step keeps: ``roots`` all of them, ``branches`` those that are joined of branches, so that the
     number of branches can be told from the graph.
     """

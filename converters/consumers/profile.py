@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NoReturn
 
+from msgspec import Struct
+
 from converters.formats.format import WriteOptions
 from converters.formats.registry import WRITTEN
 from converters.policy.policy import Policy
 from signatures.errors import ProfileError
-from signatures.records import dataclass
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Profile:
+class Profile(Struct, frozen=True, eq=False, kw_only=True):
     """A consumer of policies: ``--for NAME``.
 
     ``formats`` are those that it loads, the usual one first. ``dress`` gives the policy under the names, dtypes and

@@ -11,8 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-
-from signatures.records import dataclass
+from msgspec import Struct
 
 #: Bytes that are handed on at once.
 _CHUNK = 4 << 20
@@ -20,8 +19,7 @@ _CHUNK = 4 << 20
 _TILE = (128, 64)
 
 
-@dataclass(frozen=True, slots=True)
-class _Span:
+class _Span(Struct, frozen=True):
     """The bytes of an array from ``first`` to ``last``."""
 
     array: np.ndarray

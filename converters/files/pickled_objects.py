@@ -19,9 +19,9 @@ from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
 import numpy as np
+from msgspec import Struct
 
 from converters.files.unpickle import KEYS, NAMES, OPCODES, SYSTEM, Function, Machine, carry_out, damaged_error, refusal
-from signatures.records import dataclass
 
 #: Types of Python that objects are pickled with.
 _PLAIN_TYPES = frozenset(
@@ -41,16 +41,14 @@ _ORDERS: dict[str, Literal["<", ">", "="]] = {"<": "<", ">": ">", "|": "=", "=":
 _MAX_AXES = 32
 
 
-@dataclass(frozen=True, slots=True)
-class Name:
+class Name(Struct, frozen=True):
     """An imported class or function, by its name alone."""
 
     module: str
     name: str
 
 
-@dataclass(slots=True)
-class Instance:
+class Instance(Struct, dict=True):
     """An object: what made it (a class, or a function), what that was given, and the state that was set afterwards."""
 
     maker: Name

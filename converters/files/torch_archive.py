@@ -17,11 +17,11 @@ from collections.abc import Collection, Mapping
 from typing import Any, Literal
 
 import numpy as np
+from msgspec import Struct
 
 from converters.files.unpickle import StorageType, Tensor, unpickle
 from converters.files.zip_archives import ZIP_ERRORS, open_archive
 from signatures.errors import DamagedFileError, NotAPolicyError
-from signatures.records import dataclass
 
 _MAGIC = 0x1950A86A20F9469CFC6C
 _PROTOCOL = 1001
@@ -31,8 +31,7 @@ _COPY_AGAIN = "copy or download it again"
 _FOREIGN = "give a checkpoint as its trainer wrote it"
 
 
-@dataclass(frozen=True, slots=True)
-class Storage:
+class Storage(Struct, frozen=True):
     """A run of numbers in the file: which one (``key``), its dtype, how many it should have."""
 
     key: str

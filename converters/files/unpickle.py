@@ -15,8 +15,9 @@ import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import IO, Any
 
+from msgspec import Struct
+
 from signatures.errors import DamagedFileError, NotAPolicyError
-from signatures.records import dataclass
 
 #: A checkpoint has some thousands of opcodes; with a critic and an optimizer some ten thousands.
 MAX_OPCODES = 1 << 21
@@ -31,15 +32,13 @@ MARK = object()
 KEYS = (str, int, float, bool, type(None))
 
 
-@dataclass(frozen=True, slots=True)
-class StorageType:
+class StorageType(Struct, frozen=True):
     """A class such as ``torch.FloatStorage``: which numbers a storage holds (numpy's name of their dtype)."""
 
     dtype: str
 
 
-@dataclass(frozen=True, slots=True)
-class Tensor:
+class Tensor(Struct, frozen=True):
     """A tensor as it is pickled: a storage, where in it the tensor begins, and the steps along each axis (elements)."""
 
     storage: Any
@@ -48,8 +47,7 @@ class Tensor:
     strides: tuple[int, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Function:
+class Function(Struct, frozen=True):
     """An imported name that may be called; ``make`` gets the arguments and gives a value of this module."""
 
     name: str

@@ -10,12 +10,12 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from msgspec import Struct, field
+
 from signatures.code import CodeOptions
-from signatures.records import dataclass
 
 if TYPE_CHECKING:
     import numpy as np
@@ -52,8 +52,7 @@ def defer_imports(room: str, *modules: str) -> list[Any]:
     return [_Deferred(f"{room}.{module}") for module in modules]
 
 
-@dataclass(frozen=True, slots=True)
-class WriteOptions:
+class WriteOptions(Struct, frozen=True):
     """What a writer needs beside the policy: the contract as JSON text, the ONNX opset, the profile's name where the
     file is made for one consumer (``--for``), whether the result is to be proved valid (ONNX: by its checker), how
     weights that were rounded are kept, for how many agents the file is (None: for any number), and the ONNX ops that
@@ -70,8 +69,7 @@ class WriteOptions:
     code: CodeOptions = CodeOptions()
 
 
-@dataclass(frozen=True, slots=True)
-class Artifact:
+class Artifact(Struct, frozen=True):
     """One policy in one format: relative path (``/`` between parts) → what the file is made of."""
 
     format: Format
@@ -97,8 +95,7 @@ class Artifact:
         return {relative: FileEntry(data.write(folder / relative), data.size) for relative, data in self.files.items()}
 
 
-@dataclass(frozen=True, slots=True)
-class Port:
+class Port(Struct, frozen=True):
     """An input or output: the name that a caller uses, its dtype (numpy's name) and shape where the file tells them.
 
     ``tensor`` is the tensor behind the name, where the format has both (the signatures of TensorFlow).
@@ -110,8 +107,7 @@ class Port:
     tensor: str | None = None
 
 
-@dataclass(frozen=True)
-class Ports:
+class Ports(Struct, frozen=True):
     """What an artefact takes and gives, whichever tool made it; ``path`` and ``options`` are what its loader takes.
 
     ``open`` is set where any node can be asked for (a frozen graph): ``outputs`` are then all nodes that can be.
@@ -124,8 +120,7 @@ class Ports:
     open: bool = False
 
 
-@dataclass(frozen=True)
-class Member:
+class Member(Struct, frozen=True):
     """A source inside of another (a run folder's export, a bundle's artefact), to be read in its place.
 
     ``name`` is the policy's where the folder says it, ``notes`` go to the policy's, ``files`` are those that said so.
@@ -137,8 +132,7 @@ class Member:
     files: tuple[Path, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class Code:
+class Code(Struct, frozen=True):
     """A snippet: how to call an artefact of a format. ``text`` has ``$path`` for what a loader is given, in quotes."""
 
     name: str
@@ -147,8 +141,7 @@ class Code:
     text: str
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Format:
+class Format(Struct, frozen=True, eq=False, kw_only=True):
     """A form in which policies are given, written or both. Unsupported features are None or empty.
 
     - ``key`` is its one name, ``label`` what people call it, ``advice`` what to do where it cannot be read.

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from msgspec import Struct
 
 from converters.graph.nodes import split_ref
-from signatures.records import dataclass
 
 if TYPE_CHECKING:
     from converters.runtimes.pool import RuntimePool
@@ -23,8 +23,7 @@ Feeds = Mapping[str, np.ndarray]
 Run = Callable[[Feeds, Sequence[str]], dict[str, np.ndarray]]
 
 
-@dataclass(frozen=True, slots=True)
-class View:
+class View(Struct, frozen=True):
     """A tensor as a format has it: its name there, and the axes it was transposed by (None: as it is)."""
 
     name: str
@@ -37,8 +36,7 @@ class View:
         return array.transpose(np.argsort(self.axes))
 
 
-@dataclass(frozen=True)
-class InnerTensors:
+class InnerTensors(Struct, frozen=True):
     """``view`` says how the format has a tensor of the graph (None: not at all), ``run`` fetches what it calls so."""
 
     view: Callable[[str], View | None]
@@ -53,8 +51,7 @@ class InnerTensors:
         return {tensor: view.restore(values[view.name]) for tensor, view in views.items()}
 
 
-@dataclass(frozen=True)
-class Loaded:
+class Loaded(Struct, frozen=True):
     """An artefact in a runtime of a pool, ``run`` as it is loaded; ``signature`` is the one called, "" for the only."""
 
     path: Path

@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from msgspec import Struct
+
 from converters.files.file_probe import Content
-from signatures.records import dataclass
 
 _SAVE_BINARY = "save it in binary: SerializeToString"
 _NETWORK_IN_JAVASCRIPT = "build the same layers in Keras or PyTorch, set the weights from this file, and export that"
 
 
-@dataclass(frozen=True, slots=True)
-class Kind:
+class Kind(Struct, frozen=True):
     """A kind of file: ``keys`` that all its files have, and ``also``, what else must hold."""
 
     key: str

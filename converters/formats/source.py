@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import field, replace
 from pathlib import Path
 from typing import Any
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from converters.files import tensorflow_messages as schema
 from converters.files.external_data import Detached
@@ -14,12 +16,10 @@ from converters.files.folders import scratch_folder
 from converters.formats.frozen_graph.subgraph import check, subgraph
 from converters.graph.nodes import Graph
 from converters.policy.facts import SourceFacts
-from signatures.records import dataclass
 from signatures.spec import SourceMap
 
 
-@dataclass(frozen=True)
-class OriginalRun:
+class OriginalRun(Struct, frozen=True):
     """How the source itself is run, for comparison: a runtime, and what its child process is told to load.
 
     ``definition`` is the GraphDef that TensorFlow runs, as the file has it, variables apart, which are constants. It
@@ -59,8 +59,7 @@ class OriginalRun:
             yield str(file), {"kind": "graph", "source": True}
 
 
-@dataclass(frozen=True)
-class SourceModel:
+class SourceModel(Struct, frozen=True):
     """One model of a source (a run folder has one per behavior; a graph may still hold several brains).
 
     ``name`` is the policy's name where the path does not give it; ``files`` are the files that were read, for the
@@ -80,8 +79,7 @@ class SourceModel:
 NO_NORMALISER = "none"
 
 
-@dataclass(frozen=True, slots=True)
-class ReadOptions:
+class ReadOptions(Struct, frozen=True):
     """What a reader may be told: the checkpoint's step (None: the newest); the shapes of the agent's sensors, in their
     order, lists of entities [most, numbers], images C, H, W (empty: as far as the source tells); whether a source may
     be loaded that runs what it says; which of the sensors are goals, by their place; the activation between layers; the

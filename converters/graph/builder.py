@@ -9,11 +9,11 @@ one over an old graph; the layers of ``converters/graph/nn`` are functions of it
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from msgspec.structs import replace
 
 from converters.graph.nodes import Graph, NameScope, Node, TensorShape, node_of, ref, topological
 from converters.graph.ops.base import REQUIRED, axis_within

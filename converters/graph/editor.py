@@ -5,10 +5,10 @@ from __future__ import annotations
 import contextlib
 import operator
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from msgspec.structs import replace
 
 from converters.graph.builder import Builder
 from converters.graph.nodes import Graph, NameScope, Node, topological

@@ -8,15 +8,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import field
 from functools import cached_property
 from typing import Any
 
 import numpy as np
+from msgspec import Struct, field
 
 from converters.graph.types import TensorType
 from signatures.errors import GraphError
-from signatures.records import dataclass
 
 #: Attribute values: bool, int, float, str, bytes, numpy dtype, ``TensorShape``, ndarray, or a tuple of these.
 AttrValue = Any
@@ -24,15 +23,13 @@ AttrValue = Any
 Inferred = tuple[Sequence[TensorType], Sequence[TensorType], int]
 
 
-@dataclass(frozen=True, slots=True)
-class TensorShape:
+class TensorShape(Struct, frozen=True):
     """A ``shape`` attribute: ``dims`` is None for an unknown rank, an entry is None for a free axis."""
 
     dims: tuple[int | None, ...] | None
 
 
-@dataclass(frozen=True, slots=True)
-class Node:
+class Node(Struct, frozen=True, dict=True):
     """One operation.
 
     ``attrs`` hold what changes the result (strides, axis, ``DstT``); dtypes that follow from the inputs (``T``) are
@@ -132,8 +129,7 @@ def downstream(node: Node, consumers: Mapping[str, list[Node]], through: Callabl
                     queue.append(reader)
 
 
-@dataclass(frozen=True)
-class Graph:
+class Graph(Struct, frozen=True, dict=True):
     """Nodes in topological order (the back edges of while loops apart), looked up by name."""
 
     nodes: tuple[Node, ...]

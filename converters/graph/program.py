@@ -8,10 +8,11 @@ from __future__ import annotations
 
 from collections import Counter as Count
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import field, replace
 from typing import Any
 
 import numpy as np
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from converters.graph.nodes import Graph, Node, TensorShape, ref
 from converters.graph.ops.loops.base import (
@@ -32,11 +33,9 @@ from converters.graph.ops.loops.base import (
 from converters.graph.ops.table import is_fed, op_of
 from converters.graph.shapes import infer_types
 from converters.graph.types import BOOL, FLOAT32, INT64, TensorType
-from signatures.records import dataclass
 
 
-@dataclass(eq=False)
-class Place:
+class Place(Struct, eq=False):
     """What holds the elements of a tensor: an input, a constant (``value``), or a part of the arena from ``offset``."""
 
     kind: str
@@ -47,8 +46,7 @@ class Place:
     offset: int = 0
 
 
-@dataclass(eq=False)
-class Stage:
+class Stage(Struct, eq=False):
     """One nest of loops: every element of ``result``, and the layer of the source that it stands for."""
 
     result: Tensor
@@ -58,8 +56,7 @@ class Stage:
     about: str
 
 
-@dataclass(eq=False)
-class Program:
+class Program(Struct, eq=False):
     """Stages in their order, the constants that they read, the inputs and outputs by name, the size of each arena."""
 
     stages: list[Stage]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
+from msgspec import Struct
 
 from converters.graph.jitter import Jitter
 from converters.graph.nodes import Graph, Node, node_of, normal_ref, reachable, ref
@@ -12,7 +13,6 @@ from converters.graph.ops.base import OpDef
 from converters.graph.ops.table import op_of
 from converters.graph.shapes import run_kernel_as_it_is
 from signatures.errors import GraphError
-from signatures.records import dataclass
 
 
 def _upstream_nodes(graph: Graph, fetch: Sequence[str], fed: Collection[str]) -> set[str]:
@@ -24,8 +24,7 @@ def _upstream_nodes(graph: Graph, fetch: Sequence[str], fed: Collection[str]) ->
     return reachable(makers(map(normal_ref, fetch)), lambda name: makers(graph[name].inputs))
 
 
-@dataclass(frozen=True, slots=True)
-class _Plan:
+class _Plan(Struct, frozen=True):
     """What is to be computed for some tensors, where some are fed."""
 
     constants: Mapping[str, np.ndarray]

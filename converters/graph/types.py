@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-
-from signatures.records import dataclass
+from msgspec import Struct
 
 #: An axis: its length, or a symbol (equal symbols are equal lengths).
 Dim = int | str
@@ -20,8 +19,7 @@ INT64 = np.dtype(np.int64)
 BOOL = np.dtype(np.bool_)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class TensorType:
+class TensorType(Struct, frozen=True, eq=False):
     """dtype and shape of a tensor (``shape`` None: unknown rank).
 
     ``value`` is the array where it is known. A shape vector that depends on the batch is known as an object array of

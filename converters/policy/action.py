@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
+from msgspec import Struct
 
 from converters.graph.nodes import Graph, Node, node_of
 from converters.graph.ops.table import passes_on, traits
 from converters.graph.shapes import infer_types
-from signatures.records import dataclass
 from signatures.roles import Role
 
 _MAX_LEAVES = 1024
@@ -17,8 +17,7 @@ _MAX_LEAVES = 1024
 _MAX_CLIPS = 4
 
 
-@dataclass(frozen=True, slots=True)
-class ActionMeaning:
+class ActionMeaning(Struct, frozen=True):
     """What ``action`` is. ``draws`` are the samplers' logits per branch, ``sizes`` the branch sizes' tensors."""
 
     role: Role

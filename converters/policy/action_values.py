@@ -9,9 +9,10 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 
+from msgspec import Struct
+
 from converters.graph.nodes import Graph, Node, normal_ref
 from converters.graph.ops.table import passes_on, traits
-from signatures.records import dataclass
 from signatures.roles import Q_NAMES, STATE_VALUE_NAMES, plain_name
 
 #: Names that say that an output is the action itself, or scores that are drawn from.
@@ -33,8 +34,7 @@ _BOUNDED = frozenset(("sigmoid", "tanh", "softmax", "softsign", "relu 6"))
 _MOST_STEPS = 32
 
 
-@dataclass(frozen=True, slots=True)
-class Candidate:
+class Candidate(Struct, frozen=True):
     """An output that may be a continuous action or values of actions.
 
     ``graph`` is normalised and folded, ``tensor`` its tensor; ``name`` is what the source calls it, ``layer`` the names
@@ -49,8 +49,7 @@ class Candidate:
     loss: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Evidence:
+class Evidence(Struct, frozen=True):
     """A sign that an output values actions: ``said`` completes "since", ``seen`` says who writes such files."""
 
     said: str

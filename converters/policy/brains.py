@@ -8,16 +8,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import field, replace
 
 import numpy as np
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from converters.graph.nodes import Graph, Node, node_of, normal_ref, split_ref
 from converters.graph.ops.table import CONTROL_FLOW, is_fed, passes_on, traits
 from converters.policy.memories import looks_like_state
 from converters.policy.rules import Decision, Rule
 from signatures.errors import NotAPolicyError, SignatureError, UsageError
-from signatures.records import dataclass
 from signatures.roles import (
     ACTING,
     ACTION_NAMES,
@@ -44,8 +44,7 @@ _LARGEST_FRAME = 16
 _MAX_LISTED = 1024
 
 
-@dataclass(frozen=True, slots=True)
-class Head:
+class Head(Struct, frozen=True):
     """One action of a policy: its name in the source, and its canonical name (hybrid policies have two)."""
 
     base: str
@@ -57,8 +56,7 @@ class Head:
         return f"deterministic_{self.name}"
 
 
-@dataclass(frozen=True, slots=True)
-class Brain:
+class Brain(Struct, frozen=True):
     """One policy of a graph: its scope (``""`` or ``"GoalieBrain/"``) and where its outputs are."""
 
     scope: str

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import field
 from typing import Any
+
+from msgspec import Struct, field
 
 from converters.policy.rules import Decision
 from signatures.memories import SeparateMemory
-from signatures.records import dataclass
 from signatures.roles import Constant, Role
 
 #: The note of a source that has float64 numbers.
 DOUBLES_NARROWED = "float64 numbers of the source are computed as float32"
 
 
-@dataclass(frozen=True)
-class SourceFacts:
+class SourceFacts(Struct, frozen=True):
     """What a reader knows of a source beside its graph.
 
     - ``roles``: placeholders whose role the format says (it goes before names and structure).

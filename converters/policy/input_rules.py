@@ -6,13 +6,13 @@ import re
 from collections.abc import Mapping
 
 import numpy as np
+from msgspec import Struct
 
 from converters.graph.nodes import Graph, Node, downstream
 from converters.graph.ops.table import passes_on, traits
 from converters.policy.memories import looks_like_state
 from converters.policy.observations import highest_colour
 from converters.policy.rules import Rule, always
-from signatures.records import dataclass
 from signatures.roles import INPUT_PATTERNS, Role
 
 #: Names of cameras: ML-Agents' own, and words that say so.
@@ -23,16 +23,14 @@ _IMAGE, _MATRIX = 4, 2
 _COUNTED = (Role.SEQUENCE_LENGTH, Role.BATCH_SIZE, Role.PREV_ACTION)
 
 
-@dataclass(frozen=True, slots=True)
-class Named:
+class Named(Struct, frozen=True):
     """A placeholder and its name without the scope of its brain."""
 
     base: str
     node: Node
 
 
-@dataclass(frozen=True, slots=True)
-class Read:
+class Read(Struct, frozen=True):
     """A placeholder whose name says nothing, in its graph.
 
     ``declared``: the format says what its inputs are; ``recurrent``: another is a memory; ``observed``: an observation

@@ -6,7 +6,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+
+from msgspec.structs import replace
 
 from converters.graph.nodes import Graph, Node, node_of
 from converters.graph.ops.table import is_fed

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import field
 
 import numpy as np
+from msgspec import Struct, field
 
 from converters.graph.nodes import Graph
-from signatures.records import dataclass
 from signatures.spec import PolicySignature, SourceMap
 
 
-@dataclass(frozen=True, slots=True)
-class Policy:
+class Policy(Struct, frozen=True):
     """A graph with its signature: the hub between all readers and all writers.
 
     ``feeds`` maps an input's canonical name to the Placeholder that takes it, ``fetches`` an output's canonical name

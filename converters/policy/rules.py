@@ -9,15 +9,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import Generic, TypeVar
 
-from signatures.records import dataclass
+from msgspec import Struct
+
 from signatures.roles import Role
 
 Subject = TypeVar("Subject")
 Verdict = TypeVar("Verdict")
 
 
-@dataclass(frozen=True, slots=True)
-class Rule(Generic[Subject, Verdict]):
+class Rule(Struct, Generic[Subject, Verdict], frozen=True):
     """``role`` is what a subject is for which ``when`` holds; ``says`` is why, as a clause."""
 
     role: Verdict
@@ -25,8 +25,7 @@ class Rule(Generic[Subject, Verdict]):
     says: str
 
 
-@dataclass(frozen=True, slots=True)
-class Decision:
+class Decision(Struct, frozen=True):
     """What a tensor is for (None: it is left out), why, and what spoke against it."""
 
     tensor: str

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Literal
 
-from signatures.records import dataclass
+from msgspec import Struct
 
 if TYPE_CHECKING:
     from converters.graph.ops.approximations import Arithmetic
@@ -13,8 +13,7 @@ if TYPE_CHECKING:
 Progress = Callable[[str], None]
 
 
-@dataclass(frozen=True, slots=True)
-class RuntimeInfo:
+class RuntimeInfo(Struct, frozen=True):
     """One runtime that artefacts can be verified in; ``how`` is the command that installs it."""
 
     name: str
@@ -25,8 +24,7 @@ class RuntimeInfo:
     supported: bool = True
 
 
-@dataclass(frozen=True, slots=True)
-class Runtime:
+class Runtime(Struct, frozen=True):
     """A runtime: whether it is here, how its child process is started and how it is installed.
 
     What it loads of a bundle, each format says (``Format.runtimes``).

@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from converters.graph.nn.activations import Activation
 from converters.graph.nn.normalisation import layer
@@ -22,7 +24,6 @@ from converters.trainers.pytorch.weights import TensorFile, Weights, pytorch_alo
 from converters.trainers.rsl_rl import per_action
 from converters.trainers.trainer import Rebuilt, Saved, Trainer
 from signatures.errors import SourceError, UsageError
-from signatures.records import dataclass
 from signatures.roles import Role
 
 _USUAL = "CleanRL's scripts have tanh in PPO, relu elsewhere and before images"
@@ -35,8 +36,7 @@ _WINDOWS = ((8, 4), (4, 2), (3, 1))
 _Outputs = dict[str, Role | None]
 
 
-@dataclass(frozen=True, slots=True)
-class _Script:
+class _Script(Struct, frozen=True):
     """A kind of script: the names that tell it, what it is called, what builds it, and the activation that the scripts
     in ``evidence`` have between their layers; empty: no script has these names.
     """
@@ -56,8 +56,7 @@ class _Script:
         return self.activation, f"{said} there, say which: --activation NAME"
 
 
-@dataclass
-class _Making:
+class _Making(Struct):
     net: Network
     activation: Activation
     told: Sequence[tuple[int, ...]]

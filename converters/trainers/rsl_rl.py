@@ -8,10 +8,11 @@ runners/on_policy_runner.py of 2.3 and 3.1; rsl_rl/models/*.py and algorithms/pp
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
 
 from converters.graph.nn.activations import Activation
 from converters.graph.nodes import Graph
@@ -21,7 +22,6 @@ from converters.trainers.pytorch.activations import activation_of
 from converters.trainers.pytorch.network import Network
 from converters.trainers.pytorch.weights import TensorFile, Weights, pytorch_alone
 from converters.trainers.trainer import Rebuilt, Saved, Trainer
-from signatures.records import dataclass
 from signatures.roles import Role
 
 _USUAL = "rsl_rl's default is elu"
@@ -31,8 +31,7 @@ _EPSILON = 1e-2
 _NORMALISER = "obs_norm"
 
 
-@dataclass(frozen=True, slots=True)
-class _Layout:
+class _Layout(Struct, frozen=True):
     """Where things are: under which key of the checkpoint, and the modules in it."""
 
     key: str

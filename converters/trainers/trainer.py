@@ -9,16 +9,16 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from msgspec import Struct
+
 from converters.files.fetch import Fetched
 from converters.graph.nodes import Graph
 from converters.policy.facts import SourceFacts
 from converters.trainers.pytorch.weights import TensorFile
 from signatures.errors import UsageError
-from signatures.records import dataclass
 
 
-@dataclass(frozen=True)
-class Saved:
+class Saved(Struct, frozen=True):
     """What was saved, and what the user says of it.
 
     ``archive`` is the file with the tensors; ``settings`` what the trainer wrote beside it in the same source (None:
@@ -46,8 +46,7 @@ class Saved:
             raise UsageError(f"--activation says nothing about {maker}", why=why, fix="leave it out")
 
 
-@dataclass(frozen=True, slots=True)
-class Rebuilt:
+class Rebuilt(Struct, frozen=True):
     """A policy, what is known of it, and the files beside the checkpoint that said something."""
 
     graph: Graph
@@ -55,8 +54,7 @@ class Rebuilt:
     files: tuple[Path, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class Trainer:
+class Trainer(Struct, frozen=True):
     """- ``label``: what people call it.
     - ``recognise`` looks at what was saved and gives what it found, for ``rebuild``; None where another wrote it.
     - ``rebuild`` gives the policy. It raises SourceError for parts that are not known, DamagedFileError, UsageError for

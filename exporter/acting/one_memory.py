@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+
+from msgspec.structs import replace
 
 from signatures.batches import Arrays, Run
 from signatures.memories import SourcePart, join_memory, split_memory

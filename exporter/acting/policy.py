@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import field, replace
 
 import numpy as np
 import numpy.typing as npt
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from exporter.acting.generator import Generator, likeliest
 from signatures.batches import Run
 from signatures.errors import BundleError, UsageError
 from signatures.ids import check_ids
-from signatures.records import dataclass
 from signatures.roles import OBSERVATIONS, Role
 from signatures.spec import ActionHead, PolicySignature, TensorSpec
 
 Array = np.ndarray
 
 
-@dataclass(frozen=True)
-class Decision:
+class Decision(Struct, frozen=True):
     """What the policy decided for each agent.
 
     ``continuous`` is float32 [agents, size], ``discrete`` int64 [agents, branches], None where the policy has no such

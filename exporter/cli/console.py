@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from msgspec import Struct
 
 from exporter.cli.group import FILE
 from exporter.cli.terminal import Bar, Progress, say, say_json, say_lines, say_paragraph
 from signatures.errors import UsageError
-from signatures.records import dataclass
 
 if TYPE_CHECKING:
     from exporter.export.pipeline import ExportResult
@@ -30,8 +30,7 @@ def _colour(reports: Sequence[ParityReport]) -> str:
     return "green" if all(r.proven for r in reports) else "yellow"
 
 
-@dataclass(frozen=True, slots=True)
-class Console:
+class Console(Struct, frozen=True):
     """How a command speaks, and which reports it writes."""
 
     as_json: bool = False

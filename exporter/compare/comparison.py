@@ -11,11 +11,12 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
 
 from converters.compiler.options import CompileOptions
 from converters.files.children.process import LoadedModel, RunFailedError
@@ -51,7 +52,6 @@ from exporter.verify.tolerances import Tolerance, check_rules
 from exporter.verify.verification import Judge, verify
 from signatures.contract import POLICY
 from signatures.errors import ExportModelError, RuntimeUnavailableError, UsageError, naming, suggestion
-from signatures.records import dataclass
 from signatures.roles import Role
 from signatures.sampling import draw_cases
 from signatures.spec import TensorSpec
@@ -60,8 +60,7 @@ _LOG = logging.getLogger(__name__)
 Progress = Callable[[str], None]
 
 
-@dataclass(frozen=True, slots=True)
-class _Problem:
+class _Problem(Struct, frozen=True):
     """What does not fit, at which of the reference's names; ``blocking`` where a run would make no sense."""
 
     name: str
@@ -69,8 +68,7 @@ class _Problem:
     blocking: bool = False
 
 
-@dataclass(frozen=True)
-class _Candidate:
+class _Candidate(Struct, frozen=True):
     """A candidate's ports with the reference's names: what it is fed and asked for under its own."""
 
     label: str

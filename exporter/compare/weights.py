@@ -5,8 +5,9 @@ weights rounded alike by numbers, and against the reference itself by what they 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
 from pathlib import Path
+
+from msgspec.structs import replace
 
 from converters.compiler.passes.weights import Storage, round_weights
 from converters.formats.bundle.bundle import Bundle

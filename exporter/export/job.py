@@ -5,10 +5,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from converters.compiler.passes.weights import Storage, round_weights
 from converters.formats.bundle.embed import FIXED_BATCH
@@ -23,7 +25,6 @@ from signatures.code import CodeOptions
 from signatures.contract import Contract, Origin, parse
 from signatures.errors import SignatureError, TooLargeError, UsageError, naming
 from signatures.fields import FieldError, printable, without_none
-from signatures.records import dataclass
 
 if TYPE_CHECKING:
     from converters.consumers.profile import Profile
@@ -34,8 +35,7 @@ if TYPE_CHECKING:
 MOST_AGENTS = 1 << 16
 
 
-@dataclass(frozen=True, slots=True)
-class Job:
+class Job(Struct, frozen=True):
     """One policy to write, and where it comes from."""
 
     source: Source

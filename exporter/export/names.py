@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import field
 from pathlib import Path, PurePath, PurePosixPath
 from typing import Generic, Protocol, TypeVar
 
+from msgspec import Struct, field
+
 from converters.files.fetch import address_of, path_text
 from signatures.contract import safe_name
-from signatures.records import dataclass
 
 #: A name, and why it is another than the source's.
 Claimed = tuple[str, str | None]
@@ -50,16 +50,14 @@ class Names:
         return found, f"called {found}: {name} is {'another' if other == path else 'the'} policy of {path_text(other)}"
 
 
-@dataclass(frozen=True, slots=True)
-class Claim:
+class Claim(Struct, frozen=True):
     """What a worker asks: names for the policies of its source."""
 
     path: Path
     names: Sequence[str]
 
 
-@dataclass
-class Turns(Generic[Who]):
+class Turns(Struct, Generic[Who]):
     """Who waits for names: each until all sources before its own have theirs, or have ended without; so names do not
     depend on who is quick.
     """

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import field
 from pathlib import Path
 from typing import get_args
+
+from msgspec import Struct, field
 
 from converters.compiler.options import CompileOptions
 from converters.compiler.passes.weights import Storage
@@ -14,11 +15,9 @@ from exporter.export.labels import Labels
 from exporter.verify.options import VerifyOptions
 from signatures.code import CodeOptions
 from signatures.errors import UsageError
-from signatures.records import dataclass
 
 
-@dataclass(frozen=True)
-class ExportOptions:
+class ExportOptions(Struct, frozen=True):
     """What ``export-model`` may be told; see the command line for the meaning of each."""
 
     out: Path = Path("exported")

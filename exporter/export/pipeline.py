@@ -5,9 +5,11 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from converters.files.fetch import path_text
 from converters.files.folders import scratch_folder
@@ -43,19 +45,19 @@ from signatures.errors import (
     RefusedError,
     UsageError,
 )
-from signatures.records import dataclass
 
 if TYPE_CHECKING:
     from converters.consumers.profile import Profile
     from converters.runtimes.pool import RuntimePool
     from converters.runtimes.registry import RuntimeInfo
     from exporter.verify.report import ParityReport
+else:
+    ParityReport = Any  # help() evaluates the annotations of a Struct
 
 Progress = Callable[[str], None]
 
 
-@dataclass(frozen=True, slots=True)
-class ExportResult:
+class ExportResult(Struct, frozen=True):
     """One policy, written: its bundle (``<policy>.failed`` where the formats disagree), contract and report."""
 
     policy: Policy

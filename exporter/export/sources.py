@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import field, replace
 from pathlib import Path
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from converters.compiler.compile import compile_graph, explanations
 from converters.compiler.options import CompileOptions
@@ -15,14 +17,12 @@ from converters.formats.source import ReadOptions, SourceModel
 from converters.policy.policy import Policy
 from converters.policy.rules import Decision
 from signatures.errors import ExportModelError, naming
-from signatures.records import dataclass
 
 #: File names that say nothing of the policy: the folder's name, its behavior, does.
 _NAMELESS = ("frozen_graph_def.pb", "saved_model.pb", "model.json", "checkpoint")
 
 
-@dataclass(frozen=True)
-class Source:
+class Source(Struct, frozen=True):
     """A file or folder that was read: its models, and where they came from."""
 
     path: Path

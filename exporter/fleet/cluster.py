@@ -15,10 +15,12 @@ import time
 import uuid
 from collections.abc import Iterator, Sequence
 from concurrent.futures import CancelledError
-from dataclasses import dataclass, replace
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from converters.files.fetch import address_of, path_text
 from converters.runtimes.pool import RuntimePool
@@ -38,8 +40,7 @@ _AHEAD = 2
 _FORGOTTEN = 900
 
 
-@dataclass(frozen=True)
-class Run:
+class Run(Struct, frozen=True):
     """What every task of a run is told."""
 
     identity: str
@@ -178,8 +179,7 @@ def program_version() -> str:
 # ------------------------------------------------------------------ on the machine that asks
 
 
-@dataclass
-class Cluster:
+class Cluster(Struct):
     """Sources spread over a cluster's workers: an executor of a fleet, as its own processes are."""
 
     address: str

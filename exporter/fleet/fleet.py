@@ -11,12 +11,13 @@ import os
 import signal
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from multiprocessing.resource_tracker import ensure_running
 from pathlib import Path
 from typing import Any
+
+from msgspec import Struct, field
 
 from converters.files.fetch import path_text
 from converters.runtimes.pool import RuntimePool
@@ -119,16 +120,14 @@ def _interrupts_wait() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-@dataclass
-class _Worker:
+class _Worker(Struct):
     process: BaseProcess
     pipe: Connection
     #: which source it is at
     at: int
 
 
-@dataclass
-class _Crew:
+class _Crew(Struct):
     options: ExportOptions
     wanted: Wanted
     turns: Turns[_Worker]

@@ -10,6 +10,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from msgspec import Struct
+
 from converters.files.children.child import end_with_parent
 from converters.files.fetch import path_text
 from converters.runtimes.pool import RuntimePool
@@ -20,11 +22,9 @@ from exporter.fleet.ledger import Stamp, State, stamps, state
 from exporter.reports.entry import Entry, of_result
 from signatures.cycles import raise_gc_threshold
 from signatures.errors import ExportModelError, RefusedError, SourceError
-from signatures.records import dataclass
 
 
-@dataclass(frozen=True, slots=True)
-class Written:
+class Written(Struct, frozen=True):
     """A policy of many, written; ``entry`` where reports were asked for, ``failure`` where formats disagree,
     ``undecided`` why nothing was decided.
     """
@@ -40,8 +40,7 @@ class Written:
     entry: Entry | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Outcome:
+class Outcome(Struct, frozen=True):
     """What became of a source: its policies, or why there are none (or not all of them)."""
 
     path: Path
@@ -58,8 +57,7 @@ class Outcome:
         return self.error is not None or any(p.passed is False for p in self.policies)
 
 
-@dataclass(frozen=True, slots=True)
-class Wanted:
+class Wanted(Struct, frozen=True):
     """What a caller needs of each policy beside the verdict; nothing of it is kept otherwise."""
 
     answers: bool = False
@@ -115,8 +113,7 @@ def _silent(text: str) -> None:
     """Steps of one of many are not told."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Asking:
+class _Asking(Struct, frozen=True):
     pipe: Connection
 
     def claim(self, path: Path, names: Sequence[str]) -> list[Claimed]:

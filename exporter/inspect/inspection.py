@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import Struct, field
 
 from converters.compiler.options import CompileOptions
 from converters.consumers.named_files import artifact_of
@@ -25,7 +25,6 @@ from signatures.contract import safe_name
 from signatures.errors import ExportModelError, naming
 from signatures.fields import printable
 from signatures.ids import bounds_text
-from signatures.records import dataclass
 from signatures.roles import Role
 from signatures.spec import PolicySignature, TensorSpec
 
@@ -57,8 +56,7 @@ _MOST_NODES = 600
 _MOST_STATISTICS = 12
 
 
-@dataclass(frozen=True, slots=True)
-class PolicyInspection:
+class PolicyInspection(Struct, frozen=True):
     """One policy of a source."""
 
     policy: Policy
@@ -89,8 +87,7 @@ class PolicyInspection:
         }
 
 
-@dataclass(frozen=True, slots=True)
-class Inspection:
+class Inspection(Struct, frozen=True):
     """A source and its policies."""
 
     path: Path

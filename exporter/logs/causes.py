@@ -11,10 +11,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import combinations, pairwise
 
 import numpy as np
+from msgspec import Struct
 
 from exporter.logs.recording import NONE, Array, Arrays, Recording
 from exporter.logs.replay import MemoryUse
-from signatures.records import dataclass
 from signatures.roles import Role
 from signatures.spec import PolicySignature, TensorSpec
 
@@ -54,8 +54,7 @@ InputChange = Callable[[Arrays], dict[str, Array]]
 AnswerChange = Callable[[Array, Recording], Array]
 
 
-@dataclass(frozen=True)
-class Cause:
+class Cause(Struct, frozen=True):
     """One explanation. ``kind`` is its row of the table, ``where`` the tensor or column, ``says`` the sentence."""
 
     kind: str

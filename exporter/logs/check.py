@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from msgspec import Struct
 
 from exporter.logs.causes import Cause
 from exporter.logs.judging import LOG_TOLERANCE, Target, targets_of
@@ -16,14 +17,12 @@ from exporter.logs.replay import Replay
 from exporter.logs.search import LEAST, explain
 from exporter.logs.trials import Trials, Verdict
 from exporter.verify.tolerances import Tolerance
-from signatures.records import dataclass
 
 if TYPE_CHECKING:
     from exporter.acting.policy import LoadedPolicy
 
 
-@dataclass(frozen=True)
-class WorstStep:
+class WorstStep(Struct, frozen=True):
     """The element that is farthest from the answer: its step, name, and both numbers."""
 
     step: int
@@ -36,8 +35,7 @@ class WorstStep:
         return {"step": self.step, "column": self.column, "logged": self.logged, "computed": self.computed}
 
 
-@dataclass(frozen=True)
-class LogReport:
+class LogReport(Struct, frozen=True):
     """What came of it.
 
     - ``fits``: every step is what the policy answers; ``misfits``: bool [steps], which are not; ``first``, ``worst``.

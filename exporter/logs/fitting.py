@@ -9,11 +9,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from msgspec import Struct
 
 from exporter.logs.causes import Cause, InputChange, column_name, on, scale_column, vectors
 from exporter.logs.recording import Array, Recording
 from exporter.logs.trials import Chain, Trials
-from signatures.records import dataclass
 from signatures.spec import PolicySignature
 
 TURNS = 14
@@ -30,8 +30,7 @@ SCANNED_OFFSETS = tuple(float(sign * 0.1 * 1.3**n) for sign in (1, -1) for n in 
 FITS = 1.5
 
 
-@dataclass(frozen=True)
-class _Column:
+class _Column(Struct, frozen=True):
     name: str
     number: int | None  # None: all of them
     where: str

@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 from itertools import pairwise
 
 import numpy as np
+from msgspec import Struct
 
 from exporter.logs.recording import Array, Arrays, Recording
 from exporter.verify.tolerances import Tolerance
-from signatures.records import dataclass
 from signatures.roles import Role
 from signatures.spec import ActionHead, PolicySignature, TensorSpec
 
@@ -28,8 +28,7 @@ CLIP_SIGMAS = 3.7
 NOISE_STEP = 0.25
 
 
-@dataclass(frozen=True)
-class Target:
+class Target(Struct, frozen=True):
     """A logged output and what it is held against.
 
     ``answer`` is the policy's output; ``scores`` what a choice is the largest of (None: choices have to be equal);
@@ -146,8 +145,7 @@ def _by_branch(target: Target, scores: Array, choices: Array) -> list[tuple[Arra
     return [(scores[:, a:b], np.clip(choices[:, i], 0, b - a - 1)) for i, (a, b) in enumerate(pairwise(edges.tolist()))]
 
 
-@dataclass(frozen=True)
-class Clip:
+class Clip(Struct, frozen=True):
     """``bounds``, [2, columns], between which a graph clips the action that it draws (infinite where it does not), and
     the standard deviation that is ``usual`` for each column.
     """
@@ -156,8 +154,7 @@ class Clip:
     usual: Array
 
 
-@dataclass(frozen=True)
-class Likelihood:
+class Likelihood(Struct, frozen=True):
     """Of each step, float64 [steps]: the log-likelihood of what was drawn, what is expected of it, and its variance;
     of choices also whether the likeliest was taken, less its odds, and the variance of that.
     """

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import field, replace
 
 import numpy as np
-
-from signatures.records import dataclass
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 Array = np.ndarray
 Arrays = Mapping[str, Array]
@@ -15,8 +14,7 @@ Arrays = Mapping[str, Array]
 NONE = -1
 
 
-@dataclass(frozen=True)
-class Recording:
+class Recording(Struct, frozen=True):
     """What a log holds of a policy's inputs and outputs, a row for each step.
 
     - ``inputs``: [steps, …] by the policy's name of the input, in its dtype; all that the policy takes but those that

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from enum import StrEnum
 
 import numpy as np
+from msgspec import Struct
 
 from exporter.logs.recording import NONE, Array, Arrays
 from signatures.batches import Run
-from signatures.records import dataclass
 from signatures.roles import Role
 from signatures.spec import PolicySignature
 
@@ -29,8 +29,7 @@ class MemoryUse(StrEnum):
     DROPPED = "always zero"
 
 
-@dataclass(frozen=True)
-class Replay:
+class Replay(Struct, frozen=True):
     """Runs a policy over rows. ``fetch`` are the outputs that are wanted."""
 
     run: Run

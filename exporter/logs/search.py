@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from msgspec import Struct
 
 from exporter.logs.causes import Cause, action_causes, drawn_action_causes, input_causes, lag_causes
 from exporter.logs.fitting import fitted_causes, scanned_causes
@@ -17,7 +18,6 @@ from exporter.logs.judging import ties
 from exporter.logs.recording import NONE, Array, Recording
 from exporter.logs.replay import MemoryUse
 from exporter.logs.trials import Chain, Trials, Verdict
-from signatures.records import dataclass
 
 #: Steps that all causes are tried on, and that the best are tried on.
 FEW, MANY = 64, 5_000
@@ -41,8 +41,7 @@ LEAST = 12.0
 DEEP, EPISODES = 24, 16
 
 
-@dataclass(frozen=True)
-class Explanation:
+class Explanation(Struct, frozen=True):
     """``causes``, in the order in which they are applied, and the verdict on all steps with them; ``others`` explain
     as much. ``whole``: no step is left but for a hiccup.
     """

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
+from msgspec import Struct
 
 from exporter.logs.causes import Cause
 from exporter.logs.judging import BEYOND, NOISE_STEP, Clip, Likelihood, Target, likelihood, measured_spread, shares
 from exporter.logs.recording import NONE, Array, Arrays, Recording
 from exporter.logs.replay import CHUNK_ELEMENTS, MemoryUse, Replay
 from exporter.verify.tolerances import Tolerance
-from signatures.records import dataclass
 
 #: Inputs are moved by so much of their size, and by what text cut off, to see what rounding explains.
 MOVED = 2.0**-21
@@ -25,8 +25,7 @@ MEASURED_STEPS = 500
 Chain = Sequence[Cause]
 
 
-@dataclass(frozen=True)
-class Verdict:
+class Verdict(Struct, frozen=True):
     """What was found of a recording under some causes.
 
     ``shares``: by target, [steps, columns], of what is allowed; ``draws``: by target that was judged as drawn;

@@ -6,11 +6,11 @@ import time
 from collections.abc import Callable, Iterator
 
 import numpy as np
+from msgspec import Struct
 
 from exporter.acting.policy import LoadedPolicy
 from exporter.play.worlds import World
 from signatures.errors import UsageError
-from signatures.records import dataclass
 
 Array = np.ndarray
 #: Episodes that are played at once; more are played in turns.
@@ -23,8 +23,7 @@ Watch = Callable[[int, Array], None]
 Advance = Callable[[int, int, float], None]
 
 
-@dataclass
-class Episodes:
+class Episodes(Struct):
     """What came of each episode: ``returns`` float64, ``lengths`` int64, ``success`` bool, [episodes] each."""
 
     returns: Array

@@ -24,11 +24,11 @@ import re
 from statistics import NormalDist
 
 import numpy as np
+from msgspec import Struct
 
 from exporter.play.student import t_quantile
 from exporter.verify.statistics import FALSE_ALARM
 from signatures.errors import UsageError
-from signatures.records import dataclass
 
 EQUIVALENT, DIFFERENT, NOT_DECIDED = "EQUIVALENT", "DIFFERENT", "NOT DECIDED"
 #: Of the interval that has to lie within the margin.
@@ -42,8 +42,7 @@ MOST_EPISODES = 1_000_000
 POWER = 0.95
 
 
-@dataclass(frozen=True, slots=True)
-class Margin:
+class Margin(Struct, frozen=True):
     """How far mean returns may be apart: a number, or a share of how large the reference's returns are."""
 
     value: float
@@ -72,8 +71,7 @@ def scale_of(returns: np.ndarray) -> float:
     return float(max(abs(returns.mean()), high - low))
 
 
-@dataclass(frozen=True, slots=True)
-class Equivalence:
+class Equivalence(Struct, frozen=True):
     """What pairs of episodes tell: the mean difference of returns, its interval, the verdict."""
 
     verdict: str

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 
 import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
 
 from converters.files.children.process import RunFailedError
 from converters.formats.bundle.embed import runnable
@@ -31,7 +32,6 @@ from exporter.verify.trial import Inputs, Trial
 from exporter.verify.verification import Participants, verify
 from signatures.batches import Arrays, Run
 from signatures.errors import ExportModelError
-from signatures.records import dataclass
 from signatures.spec import PolicySignature
 
 Progress = Callable[[str], None]
@@ -39,8 +39,7 @@ Progress = Callable[[str], None]
 _MORE = 1 << 31
 
 
-@dataclass(frozen=True)
-class Played:
+class Played(Struct, frozen=True):
     """One artefact in one runtime: its episodes, and how their returns compare with the reference's."""
 
     format: str

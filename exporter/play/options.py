@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from msgspec import Struct
+from msgspec.structs import force_setattr
+
 from exporter.acting.generator import MAX_SEED
 from exporter.play.equivalence import LEAST_EPISODES, MOST_EPISODES, Margin, parse_margin
 from signatures.errors import whole
-from signatures.records import dataclass
 
 
-@dataclass(frozen=True)
-class PlayOptions:
+class PlayOptions(Struct, frozen=True):
     """How to play."""
 
     #: Episodes that each plays.
@@ -24,9 +25,9 @@ class PlayOptions:
     most: int = 12_800
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "episodes", whole("episodes", self.episodes, LEAST_EPISODES, MOST_EPISODES))
-        object.__setattr__(self, "seed", whole("seed", self.seed, 0, MAX_SEED))
-        object.__setattr__(self, "most", whole("most", self.most, 0, MOST_EPISODES))
+        force_setattr(self, "episodes", whole("episodes", self.episodes, LEAST_EPISODES, MOST_EPISODES))
+        force_setattr(self, "seed", whole("seed", self.seed, 0, MAX_SEED))
+        force_setattr(self, "most", whole("most", self.most, 0, MOST_EPISODES))
         parse_margin(self.margin)
 
     @property

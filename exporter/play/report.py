@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
 
 from exporter.play.episodes import Episodes
 from exporter.play.equivalence import CONFIDENCE, DIFFERENT, EQUIVALENT, NOT_DECIDED, scale_of
@@ -13,11 +14,9 @@ from exporter.play.match import Played
 from exporter.play.options import PlayOptions
 from exporter.tables import table
 from exporter.verify.report import ParityReport
-from signatures.records import dataclass
 
 
-@dataclass(frozen=True)
-class PlayReport:
+class PlayReport(Struct, frozen=True):
     """The replay of recorded states, and the returns of everything that played beside the reference's."""
 
     policy: str

@@ -6,21 +6,20 @@ from collections.abc import Callable, Mapping
 from typing import Protocol
 
 import numpy as np
+from msgspec import Struct
 
 from exporter.play.environments import ENVIRONMENTS
 from exporter.play.environments.base import Environment, Observation
 from exporter.play.environments.tennis import BRAINS
 from exporter.serve.scenes import SCENES, Scene
 from signatures.errors import UsageError
-from signatures.records import dataclass
 from signatures.roles import Role
 from signatures.spec import PolicySignature
 
 Array = np.ndarray
 
 
-@dataclass(frozen=True)
-class View:
+class View(Struct, frozen=True):
     """What the agents see, a row for each episode: ``observations`` by the policy's names of them."""
 
     observations: Mapping[str, Array]
@@ -28,8 +27,7 @@ class View:
     masks: Array | None = None
 
 
-@dataclass(frozen=True)
-class Outcome:
+class Outcome(Struct, frozen=True):
     """What came of a step: ``rewards`` float64, ``ended`` and ``success`` bool, [episodes] each."""
 
     view: View

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from msgspec import Struct
 
 from converters.files.fetch import path_text
 from converters.formats.bundle.bundle import Bundle
@@ -14,13 +15,11 @@ from exporter.export.pipeline import ExportResult
 from exporter.verify.report import ParityReport
 from signatures.contract import Contract
 from signatures.errors import ExportModelError
-from signatures.records import dataclass
 from signatures.sampling import draw_cases, draw_rollout
 from signatures.spec import PolicySignature
 
 
-@dataclass(frozen=True)
-class Entry:
+class Entry(Struct, frozen=True):
     """One policy in a report. ``signature`` and ``graph`` are None where there is no bundle to read them from."""
 
     report: ParityReport

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+
+from msgspec import Struct, field
 
 from converters.graph.nodes import Graph, Node, node_of
 from converters.graph.ops.table import traits
@@ -19,8 +20,7 @@ _NORMALISER = 6
 _GATES = ("sigmoid", "tanh")
 
 
-@dataclass
-class Block:
+class Block(Struct):
     """Nodes that are drawn as one box. ``kind`` is ``input``, ``layer`` or ``output``."""
 
     kind: str

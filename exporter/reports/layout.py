@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from signatures.records import dataclass
+from msgspec import Struct
 
 _GAP, _ROW = 22.0, 70.0
 #: Width that an edge takes in a row that it only passes.
@@ -13,8 +13,7 @@ _SWEEPS = 12
 _MARGIN = 22.0
 
 
-@dataclass
-class Place:
+class Place(Struct):
     """A box, or (``item`` None) a point that a long edge passes: centre, width, row, places above it."""
 
     item: int | None
@@ -24,8 +23,7 @@ class Place:
     x: float = 0.0
 
 
-@dataclass(frozen=True)
-class Layout:
+class Layout(Struct, frozen=True):
     """Places by index; ``edges`` are chains of places from a box down to a box. Sizes are pixels."""
 
     places: list[Place]

@@ -7,13 +7,13 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from msgspec import Struct
+
 from exporter.reports.entry import Entry
 from signatures.errors import UsageError
-from signatures.records import dataclass
 
 
-@dataclass(frozen=True, slots=True)
-class Documents:
+class Documents(Struct, frozen=True):
     """What makes each kind of report; none is made that nobody asked for."""
 
     junit: Callable[[], bytes]
@@ -42,8 +42,7 @@ def parity_documents(entries: Callable[[], Sequence[Entry]]) -> Documents:
     return Documents(junit, html, markdown)
 
 
-@dataclass(frozen=True, slots=True)
-class Destinations:
+class Destinations(Struct, frozen=True):
     """The files to write; ``markdown`` may be "-", which is stdout."""
 
     junit: Path | None = None

@@ -10,6 +10,8 @@ import html
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+from msgspec import Struct
+
 from converters.formats.bundle.bundle import Bundle, dumps
 from exporter import __version__
 from exporter.serve.scenes import other_side, scene_of
@@ -17,7 +19,6 @@ from exporter.serve.server import INDEX
 from exporter.serve.site import MADE_BY, PAGE, SITE, assemble, assemble_one_file
 from exporter.tables import count_text
 from signatures.errors import BundleError, ExportModelError
-from signatures.records import dataclass
 
 PREVIEWS = Path(__file__).resolve().parent / "previews"
 STYLE = "gallery.css"
@@ -68,8 +69,7 @@ _PAGE = """\
 _TEXT = "Trained policies act in your browser, each beside the same network untrained."
 
 
-@dataclass(frozen=True)
-class Gallery:
+class Gallery(Struct, frozen=True):
     """Its files by path, the policies that it shows, and why others are left out."""
 
     files: Mapping[str, bytes]

@@ -5,16 +5,16 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
+from msgspec import Struct
+
 from signatures.errors import UsageError
-from signatures.records import dataclass
 from signatures.roles import Role
 from signatures.spec import PolicySignature
 
 AUTO, NONE = "auto", "none"
 
 
-@dataclass(frozen=True)
-class Scene:
+class Scene(Struct, frozen=True):
     """``page/scenes/<id>.mjs``. ``side`` is the part of a scene that two policies play in."""
 
     id: str

@@ -9,6 +9,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from msgspec import Struct
+
 import converters.formats.tfjs
 from converters.files.fetch import Fetched
 from converters.formats.bundle.bundle import Bundle, dumps, writing
@@ -24,7 +26,6 @@ from exporter.serve.selftest import golden
 from exporter.serve.server import DATA, INDEX, TYPES
 from signatures.contract import PARITY, POLICY
 from signatures.errors import BundleError, RuntimeUnavailableError, naming
-from signatures.records import dataclass
 
 PAGE = Path(__file__).resolve().parent / "page"
 POLICY_MODULE = Path(converters.formats.tfjs.__file__).resolve().parent / "js" / "policy.mjs"
@@ -49,8 +50,7 @@ _TFJS = "@tensorflow/tfjs"
 _ORT = "onnxruntime-web"
 
 
-@dataclass(frozen=True)
-class _Backend:
+class _Backend(Struct, frozen=True):
     """What runs a policy besides the page's own kernels: ``files`` of a ``package``, the first one its script."""
 
     name: str

@@ -7,9 +7,11 @@ import math
 import re
 import shlex
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from string import Template
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from converters.formats.bundle import bundle
 from converters.formats.frozen_graph.reader import read_graph
@@ -17,7 +19,6 @@ from converters.formats.registry import FROZEN_GRAPH
 from signatures.contract import Contract
 from signatures.errors import naming
 from signatures.ids import bounds_text
-from signatures.records import dataclass
 from signatures.roles import Role
 from signatures.spec import PolicySignature, TensorSpec
 
@@ -38,8 +39,7 @@ STEPS = 3
 WIDTH = 100
 
 
-@dataclass(frozen=True)
-class Bundle:
+class Bundle(Struct, frozen=True):
     """A bundle as the snippets need it; ``folder`` is written into the code as it was given."""
 
     folder: Path

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import json
 
-from signatures.records import dataclass
+from msgspec import Struct
 
 #: Where the files of npm packages lie by version.
 CDN = "https://cdn.jsdelivr.net/npm"
 
 
-@dataclass(frozen=True, slots=True)
-class Package:
+class Package(Struct, frozen=True):
     """An npm package: the ES module that a page imports, and its SHA-384 as base64."""
 
     name: str

@@ -7,16 +7,16 @@ from functools import partial
 from string import Template
 from typing import Any
 
+from msgspec import Struct
+
 from converters.formats.format import Code, Format
 from converters.formats.registry import BARRACUDA, CSHARP, FROZEN_GRAPH, ONNX, SAVED_MODEL, TFJS, WRITTEN
 from exporter.snippets import agent, csharp, godot, javascript, python, recorders, serving, unity
 from exporter.snippets.contract import Bundle, string_literal
 from signatures.errors import BundleError, UsageError
-from signatures.records import dataclass
 
 
-@dataclass(frozen=True)
-class Target:
+class Target(Struct, frozen=True):
     """One way to call a policy: its name for ``--for``, title, language, and the formats it needs: any of them, or of
     several that it needs together.
     """
@@ -103,8 +103,7 @@ TARGETS += tuple(
 )
 
 
-@dataclass(frozen=True)
-class Snippet:
+class Snippet(Struct, frozen=True):
     """The code of a target for one bundle."""
 
     target: Target

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from msgspec import Struct
+
 from exporter.snippets.contract import Bundle, branch_lines, number_names
-from signatures.records import dataclass
 from signatures.roles import ACTION_SHAPE, IS_CONTINUOUS, MEMORY_SIZE, VERSION_NUMBER, Role
 from signatures.spec import TensorSpec
 
 
-@dataclass(frozen=True)
-class Generation:
+class Generation(Struct, frozen=True):
     """A span of ML-Agents versions and what its brain can do with a graph."""
 
     name: str

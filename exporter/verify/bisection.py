@@ -13,6 +13,7 @@ from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
+from msgspec import Struct
 
 from converters.files.children.process import RunFailedError
 from converters.formats.bundle.embed import runnable
@@ -31,7 +32,6 @@ from exporter.verify.inner_tensors import inner_tensors, outputs_read
 from exporter.verify.participants import Feeds, Participant, PolicyUnderTest
 from exporter.verify.tolerances import Tolerance
 from signatures.errors import ExportModelError
-from signatures.records import dataclass
 
 #: Bytes of expected values that one fetch may ask for: what a runtime holds and sends at a time.
 FETCH_BYTES = 64 << 20
@@ -162,8 +162,7 @@ class Bisector:
         return node.origin
 
 
-@dataclass(frozen=True, eq=False)
-class _Search:
+class _Search(Struct, frozen=True, eq=False):
     graph: Graph
     candidate: InnerTensors
     feeds: Feeds

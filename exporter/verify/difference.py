@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 
 import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
 
 from exporter.verify.tolerances import Tolerance
-from signatures.records import dataclass
 
 #: Integer dtypes that TensorFlow.js has not: int32 in place of int64 there is listed, not a failure.
 NARROWED = {("int64", "int32")}
@@ -25,8 +25,7 @@ FIRST, LAST = -12, 3
 BINS = 1 + LAST - FIRST + 1
 
 
-@dataclass(frozen=True, slots=True)
-class Difference:
+class Difference(Struct, frozen=True):
     """How far a candidate is from the reference; ``reason`` says what is wrong where it is not a number."""
 
     max_abs: float

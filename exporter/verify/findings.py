@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 from typing import Any, ClassVar
 
+from msgspec import Struct
+
 from converters.files.children.process import RunFailedError
 from exporter.verify.difference import by_decade
 from exporter.verify.statistics import FALSE_ALARM
 from exporter.verify.tolerances import Tolerance
 from signatures.fields import without_none
-from signatures.records import dataclass
 
 
-@dataclass(frozen=True, slots=True)
-class Bisection:
+class Bisection(Struct, frozen=True):
     """Where a disagreement begins: the first tensor in graph order that differs in that runtime.
 
     ``source`` is the tensor of the source that it stands for. ``index`` is where the worst element is, ``expected`` and
@@ -68,8 +68,7 @@ class Bisection:
         return f"{text}; {self.reason}" if self.reason else text
 
 
-@dataclass(frozen=True, slots=True)
-class Finding:
+class Finding(Struct, frozen=True):
     """What a check says of one output of one format in one runtime, over all inputs that it tried.
 
     Each kind says what it is called in parity.json, and how it is told in a sentence and in a table's cell.
@@ -194,10 +193,9 @@ class Finding:
         }
 
 
-class Numbers(Finding):
+class Numbers(Finding, frozen=True):
     """An output's numbers, inputs given one at a time."""
 
-    __slots__ = ()
     kind = "numbers"
     measured = True
 
@@ -208,25 +206,22 @@ class Numbers(Finding):
         return share_text(self.share), f"{self.max_abs_diff:.2e}", f"{self.max_rel_diff:.2e}", bound
 
 
-class Rollout(Numbers):
+class Rollout(Numbers, frozen=True):
     """An output's numbers with the memory fed back; ``drift`` has the worst difference of each step."""
 
-    __slots__ = ()
     kind = "rollout"
 
 
-class Shape(Finding):
+class Shape(Finding, frozen=True):
     """A drawn output's shape, dtype and range."""
 
-    __slots__ = ()
     kind = "shape"
     words = ("drawn", "drawn")
 
 
-class Draws(Shape):
+class Draws(Shape, frozen=True):
     """How a drawn output is distributed; ``max_abs_diff`` is the p-value's complement."""
 
-    __slots__ = ()
     kind = "draws"
 
     def columns(self) -> tuple[str, str, str, str]:
@@ -234,12 +229,11 @@ class Draws(Shape):
         return "", "", "", f"p >= {FALSE_ALARM:g}: p = {1 - self.max_abs_diff:.2g}"
 
 
-class Decisions(Finding):
+class Decisions(Finding, frozen=True):
     """How many choices of a policy whose weights were rounded are other ones, or how far an action moves beside how
     far it varies; ``reason`` says it whether it passed or not, ``runtime`` is what weights were rounded to.
     """
 
-    __slots__ = ()
     kind = "decisions"
     wrong = "with weights rounded to {0.runtime}, {0.output} is another one: {0.reason}"
 
@@ -252,46 +246,41 @@ class Decisions(Finding):
         return "", f"{self.max_abs_diff:.2%}", "", f"{self.tolerance.atol:.0%}"
 
 
-class Failure(Finding):
+class Failure(Finding, frozen=True):
     """A runtime that gave no answer; ``output`` is "*" where that is so for all."""
 
-    __slots__ = ()
     kind = "failure"
     wrong = "{0.where}: {0.reason}"
 
 
-class Undecided(Finding):
+class Undecided(Finding, frozen=True):
     """Why nothing could be compared: the reference died, or it has no finite number; ``output`` "*" stands for all."""
 
-    __slots__ = ()
     kind = "undecided"
     words = ("decided", "not decided")
     wrong = "not decided: {0.reason}"
     judges = False
 
 
-class Accepted(Finding):
+class Accepted(Finding, frozen=True):
     """What a consumer's own checker says to a file; ``runtime`` is the release."""
 
-    __slots__ = ()
     kind = "accepted"
     words = ("accepted", "refused")
     wrong = "{0.format} is not accepted by {0.runtime}: {0.reason}"
 
 
-class Played(Accepted):
+class Played(Accepted, frozen=True):
     """What our model of a release's player does with a file; ``runtime`` is the release."""
 
-    __slots__ = ()
     kind = "played"
     words = ("played", "not played")
     wrong = "{0.format} is not played by our model of the player of {0.runtime}: {0.reason}"
 
 
-class Size(Finding):
+class Size(Finding, frozen=True):
     """The bytes of a format beside its budget; ``max_abs_diff`` is what there is too many."""
 
-    __slots__ = ()
     kind = "size"
     words = ("kept", "exceeded")
     wrong = "{0.format} is too large: {0.reason}"

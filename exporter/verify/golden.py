@@ -11,12 +11,12 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from msgspec import Struct
 
 from converters.files.fetch import read_bytes
 from converters.files.zip_archives import ZIP_ERRORS, entry_of, open_archive
 from exporter.verify.npy import read_array
 from signatures.errors import SourceError, UsageError
-from signatures.records import dataclass
 from signatures.roles import Role
 from signatures.sampling import Case
 from signatures.spec import PolicySignature, TensorSpec
@@ -28,8 +28,7 @@ MAX_UNPACKED_FREE, MAX_UNPACKED_FACTOR = 1 << 26, 20
 _DEFAULTS = {Role.MEMORY_IN: 0, Role.NOISE: 0, Role.MASKS: 1}
 
 
-@dataclass(frozen=True)
-class Golden:
+class Golden(Struct, frozen=True):
     """What was recorded: cases to run, and for each the recorded outputs (by canonical name; none may be there)."""
 
     cases: tuple[Case, ...] = ()

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import field
 from pathlib import Path
+
+from msgspec import Struct, field
+from msgspec.structs import force_setattr
 
 from exporter.verify.tolerances import Tolerance, ToleranceRule
 from signatures.errors import UsageError, whole
-from signatures.records import dataclass
 
 
-@dataclass(frozen=True)
-class VerifyOptions:
+class VerifyOptions(Struct, frozen=True):
     """How to verify."""
 
     seed: int = 0
@@ -33,7 +33,7 @@ class VerifyOptions:
 
     def __post_init__(self) -> None:
         for name, value, least in (("seed", self.seed, 0), ("samples", self.samples, 1), ("steps", self.steps, 1)):
-            object.__setattr__(self, name, whole(name, value, least))
+            force_setattr(self, name, whole(name, value, least))
         for name, bound in (("atol", self.tolerance.atol), ("rtol", self.tolerance.rtol)):
             if not math.isfinite(bound) or bound < 0:
                 raise UsageError(f"{name} is {bound}", fix="give a number that is not negative")

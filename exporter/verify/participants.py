@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from msgspec import Struct, field
 
 from converters.consumers.named_files import answered_outputs
 from converters.files.children.process import LoadedModel, RunFailedError
@@ -19,7 +19,6 @@ from converters.runtimes.pool import FIXED, RuntimePool
 from exporter.verify.findings import Finding
 from signatures.batches import batches_of, put_together, rows_of
 from signatures.code import CodeOptions
-from signatures.records import dataclass
 from signatures.spec import PolicySignature, SourceMap
 
 if TYPE_CHECKING:
@@ -39,8 +38,7 @@ Run = Callable[[Sequence[Feeds], Sequence[str]], list[dict[str, np.ndarray]]]
 Loading = Callable[[RuntimePool, bool], tuple[LoadedModel, Run]]
 
 
-@dataclass(frozen=True, kw_only=True)
-class PolicyUnderTest:
+class PolicyUnderTest(Struct, frozen=True, kw_only=True):
     """What is verified: the artefacts of one policy, and where its source is; ``policy_under_test`` makes it."""
 
     name: str
@@ -116,8 +114,7 @@ def policy_under_test(
     )
 
 
-@dataclass(kw_only=True)
-class Participant:
+class Participant(Struct, kw_only=True):
     """One format in one runtime: how to run it, what it can answer. ``model`` runs inner tensors too."""
 
     format: str

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import field, replace
 from typing import Any
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from exporter.tables import count_text
 from exporter.verify.findings import Accepted, Failure, Finding, Played, Shape, Undecided
 from exporter.verify.verdict import unchecked_formats, verdict
-from signatures.records import dataclass
 
 
 def _badness(c: Finding) -> tuple[bool, bool, float]:
     return not c.passed, c.measured, c.share if c.measured else c.max_abs_diff
 
 
-@dataclass(frozen=True, slots=True)
-class Pair:
+class Pair(Struct, frozen=True):
     """All findings on one format (of a SavedModel: one signature) in one runtime."""
 
     format: str
@@ -66,8 +66,7 @@ class Pair:
         return f"{worst.cell()} {worst.output}" + (f"; drawn: {', '.join(drawn)}" if drawn else "")
 
 
-@dataclass(frozen=True, slots=True)
-class ParityReport:
+class ParityReport(Struct, frozen=True):
     """All findings on one policy. ``passed`` is None where no independent runtime ran."""
 
     policy: str

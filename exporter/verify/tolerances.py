@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 
+from msgspec import Struct
+
 from signatures.errors import UsageError
-from signatures.records import dataclass
 from signatures.spec import PolicySignature
 
 #: |a − b| ≤ ATOL + RTOL·|b| for every element.
 ATOL = RTOL = 1e-5
 
 
-@dataclass(frozen=True, slots=True)
-class Tolerance:
+class Tolerance(Struct, frozen=True):
     """Absolute and relative tolerance of an output; ``reason`` is empty for the default."""
 
     atol: float = ATOL
@@ -21,8 +21,7 @@ class Tolerance:
     reason: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class ToleranceRule:
+class ToleranceRule(Struct, frozen=True):
     """A tolerance for some comparisons; None stands for every policy, format, runtime or output."""
 
     tolerance: Tolerance

@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from msgspec import Struct
 
 from converters.formats.bundle.embed import runnable
 from converters.formats.registry import narrows
@@ -25,7 +26,6 @@ from exporter.verify.reference import Reference
 from exporter.verify.rounding import Rounding
 from exporter.verify.tolerances import Tolerance, tolerance_by_rules, tolerance_for
 from exporter.verify.work import Allowance, products
-from signatures.records import dataclass
 from signatures.roles import Role
 from signatures.sampling import FAR_CASES, Case, draw_cases, draw_rollout, unknown_ids
 
@@ -36,8 +36,7 @@ _GIVE_UP_FACTOR = 8
 _SCORES = (Role.LOG_PROBS, Role.PROBS, Role.Q_VALUES)
 
 
-@dataclass(frozen=True)
-class Inputs:
+class Inputs(Struct, frozen=True):
     """What a policy is asked in place of inputs that are drawn: states that were met, and steps in a row."""
 
     cases: Sequence[Case]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from dataclasses import replace
+
+from msgspec.structs import replace
 
 from converters.files.children.process import LoadedModel, RunFailedError
 from converters.runtimes.pool import FIXED, INDEPENDENT, RuntimePool

@@ -15,6 +15,7 @@ import types
 from typing import Any
 
 import numpy as np
+from msgspec.structs import asdict
 
 
 def serve(name: str, signature: str, feeds: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -74,7 +75,7 @@ def in_python(code: str) -> dict[str, Any]:
         exec(compile(code, "snippet", "exec"), names)
     decision = names.get("decision")
     if decision is not None:
-        names["outputs"] = {k: v for k, v in vars(decision).items() if k != "outputs" and v is not None}
+        names["outputs"] = {k: v for k, v in asdict(decision).items() if k != "outputs" and v is not None}
     kept = {key: listed(names[key]) for key in ("feeds", "outputs", "action") if key in names}
     return {**kept, "printed": printed.getvalue()}
 

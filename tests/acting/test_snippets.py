@@ -16,12 +16,12 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from converters.formats.registry import DEFAULTS
 from converters.runtimes.javascript.node import js_home, node_executable

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
+from msgspec.structs import replace
 
 from converters.consumers.mlagents.version2 import dress_nn
 from converters.formats.barracuda.format import NnModel

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import struct
 import tracemalloc
-from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import fields, replace
 
 from converters.formats.barracuda.format import VERSIONS, Dataset, Layer, NnInput, NnMemory, NnModel, Trailer, parse
 from converters.formats.barracuda.graph import to_graph

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
+from msgspec.structs import replace
 
 from exporter.verify.difference import compare, compare_all, floor_log_probs, ties
 from exporter.verify.statistics import FALSE_ALARM, chi_square_survival, fit

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import importlib
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from converters.files.chunks import Pieces
 from converters.formats.format import WriteOptions

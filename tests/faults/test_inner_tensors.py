@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from converters.compiler.targets import FEWER_OPS, prepare
 from converters.formats.bundle.embed import runnable

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from converters.compiler.compilation import Compilation, Condition
 from converters.compiler.compile import PASSES, compilations, compile_graph

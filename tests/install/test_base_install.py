@@ -129,7 +129,7 @@ def test_the_wheel_has_the_packages_with_their_data_and_nothing_else(wheel: Path
     assert {n for n in names if n.endswith(".py")} == code
     required = [line for line in metadata.splitlines() if line.startswith("Requires-Dist:") and "extra ==" not in line]
     names_required = sorted(re.split(r"[<>=!~;]", line.split()[1])[0] for line in required)
-    assert names_required == ["click", "numpy", "onnx", "protobuf"]
+    assert names_required == ["click", "msgspec", "numpy", "onnx", "protobuf"]
     assert any(n.endswith("/licenses/LICENSE") for n in names)
     shown = metadata.partition("\n\n")[2]
     targets = re.findall(r"\]\(([^)]+)\)", shown)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import onnx
 import pytest
+from msgspec.structs import replace
 
 from exporter.play.documents import html, junit, markdown
 from exporter.play.equivalence import DIFFERENT, EQUIVALENT, NOT_DECIDED

@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import shutil
 import subprocess
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from converters.compiler.passes.weights import Storage, round_weights
 from converters.formats.format import Format, WriteOptions

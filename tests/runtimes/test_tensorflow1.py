@@ -5,10 +5,10 @@ from __future__ import annotations
 import struct
 import sys
 import zipfile
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from converters.runtimes import tensorflow1 as found
 from converters.runtimes.registry import Runtime, RuntimeInfo

@@ -8,7 +8,8 @@ do not change one another then (``row_trial.py``); or the graph decides for one 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+
+from msgspec.structs import replace
 
 from converters.compiler.passes.normalise import normalise
 from converters.compiler.passes.vmap import for_every_row

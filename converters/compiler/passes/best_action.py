@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from msgspec.structs import replace
 
 from converters.compiler.compilation import Compilation
 from converters.graph.editor import Editor

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
+from msgspec.structs import replace
 
 from converters.compiler.passes.normalise import as_placeholder
 from converters.graph.editor import Editor

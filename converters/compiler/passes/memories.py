@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import field, replace
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from converters.compiler.options import CompileOptions
 from converters.graph.editor import Editor
@@ -17,12 +19,10 @@ from converters.policy.memories import paired_memories
 from converters.policy.rules import Decision
 from signatures.errors import SignatureError
 from signatures.memories import SeparateMemory, SourcePart
-from signatures.records import dataclass
 from signatures.roles import ACTING, CANONICAL, Role
 
 
-@dataclass(frozen=True)
-class Joined:
+class Joined(Struct, frozen=True):
     """A graph with one memory, what is then said of it, and the source's tensors that it stands for, by role."""
 
     graph: Graph

@@ -7,9 +7,10 @@ their logarithm, so that it has log-probabilities and a likeliest action as ever
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
 
 from converters.compiler.compilation import Compilation
 from converters.graph.editor import Editor
@@ -18,15 +19,13 @@ from converters.graph.ops.table import passes_on, traits
 from converters.graph.shapes import infer_types
 from converters.graph.types import FLOAT32, INT64
 from converters.policy.action import clips_nothing
-from signatures.records import dataclass
 
 #: Stands for probability 0 where its logarithm is taken.
 _NEVER = 1e-30
 _NAME = "action_of_chance"
 
 
-@dataclass(frozen=True, slots=True)
-class _Choice:
+class _Choice(Struct, frozen=True):
     """A class [B] out of ``count``: what writes its probabilities [B, count] or [count], and what it draws."""
 
     count: int

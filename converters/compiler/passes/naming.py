@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
+from msgspec.structs import replace
 
 from converters.compiler.compilation import Compilation
 from converters.graph.nodes import Graph, NameScope, Node, node_of, renamed_ref, split_ref, topological

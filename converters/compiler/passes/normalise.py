@@ -8,10 +8,10 @@ flow), attributes are complete with their defaults, no attribute that TF 1.4 lac
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from msgspec.structs import replace
 
 from converters.graph.editor import Editor
 from converters.graph.nodes import Graph, Node, TensorShape

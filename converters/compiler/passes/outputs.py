@@ -9,9 +9,9 @@ kept where they have a row per agent.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
+from msgspec.structs import replace
 
 from converters.compiler.compilation import Compilation
 from converters.compiler.passes.noise import without_noise

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+
+from msgspec.structs import replace
 
 from converters.compiler.options import CompileOptions
 from converters.graph.nodes import Graph, node_of, normal_ref

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
+
+from msgspec.structs import replace
 
 from converters.compiler.compilation import Compilation
 from converters.compiler.passes.inputs import batch_size_rank, constant_value

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
+from msgspec.structs import replace
 
 from converters.graph.nodes import Graph, NameScope, Node, node_of
 from converters.graph.types import INT32

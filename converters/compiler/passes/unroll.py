@@ -13,10 +13,11 @@ the turns are more than ``MAX_NODES`` together, or write more than ``MAX_HANDED_
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import field, replace
 from typing import Any
 
 import numpy as np
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from converters.graph.editor import Editor
 from converters.graph.nodes import Graph, Node, ref, split_ref
@@ -25,7 +26,6 @@ from converters.graph.shapes import Types, add_types, infer_types
 from converters.graph.size_limits import Allowance
 from converters.graph.types import INT32, Symbols, of_array
 from signatures.errors import GraphError, NotAPolicyError, UnsupportedOpError
-from signatures.records import dataclass
 
 MAX_TURNS = 64
 #: Of a policy, before its loops are unrolled and after.
@@ -43,8 +43,7 @@ _INPUTS = {
 }
 
 
-@dataclass(frozen=True)
-class _Flow:
+class _Flow(Struct, frozen=True):
     """The content of a tensor array at one point of the program: index → tensor of the new graph."""
 
     size: int | None

@@ -11,7 +11,8 @@ computed from them.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+
+from msgspec.structs import replace
 
 from converters.compiler.passes.fold import fold
 from converters.compiler.passes.normalise import normalise

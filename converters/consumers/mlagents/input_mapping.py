@@ -9,10 +9,10 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import NoReturn
 
 import numpy as np
+from msgspec.structs import replace
 
 from converters.consumers.mlagents.names import MASKS, PREVIOUS
 from converters.consumers.mlagents.naming import Dressing

@@ -9,21 +9,21 @@ beginning are what it would have been fed, too.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from converters.consumers.mlagents import input_mapping as feeding
 from converters.consumers.mlagents.names import ACTION, CONTINUOUS, DISCRETE, RECURRENT_IN, RECURRENT_OUT
 from converters.consumers.mlagents.naming import Dressing, row
 from converters.graph.types import FLOAT32
-from signatures.records import dataclass
 from signatures.roles import Role
 from signatures.spec import Memory, TensorSpec
 
 Shape = Callable[[int], tuple[int | None, ...]]
 
 
-@dataclass(frozen=True, slots=True)
-class RecurrentState:
+class RecurrentState(Struct, frozen=True):
     """The memory as the consumer has it: ``size`` numbers for each agent, the last ``columns`` the last action."""
 
     size: int
@@ -121,8 +121,7 @@ def _last_action(dressing: Dressing, columns: int) -> str:
 _HALVES = ("c", "h")
 
 
-@dataclass(frozen=True, slots=True)
-class Part:
+class Part(Struct, frozen=True):
     """A part of a memory: what its input and its output are called, and how many numbers it has."""
 
     taken: str

@@ -7,11 +7,12 @@ turned, a float cast, a row of memory reshaped); behind it the actions are broug
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NoReturn
 
 import numpy as np
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from converters.compiler.passes.fold import fold
 from converters.compiler.passes.naming import name_tensors
@@ -27,8 +28,7 @@ from signatures.roles import Role
 from signatures.spec import Memory, SourceMap, TensorSpec
 
 
-@dataclass
-class Dressing:
+class Dressing(Struct, dict=True):
     """A policy on its way into the names of ``profile``.
 
     ``tensors`` maps the policy's own inputs, later its own outputs too, to tensors of the new graph.

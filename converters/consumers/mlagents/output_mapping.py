@@ -5,20 +5,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from msgspec import Struct
 
 from converters.consumers.mlagents.input_mapping import supply_masks
 from converters.consumers.mlagents.naming import Dressing, row
 from converters.graph.types import FLOAT32, INT64
 from converters.policy.action import action_meaning
-from signatures.records import dataclass
 from signatures.roles import ACTION_NAMES, Role
 from signatures.spec import TensorSpec
 
 _DISCRETE = (Role.SAMPLED, Role.LOG_PROBS, Role.PROBS, Role.DETERMINISTIC)
 
 
-@dataclass(frozen=True, slots=True)
-class Heads:
+class Heads(Struct, frozen=True):
     """The actions of a policy: the specs of the continuous and of the discrete one."""
 
     continuous: TensorSpec | None
@@ -52,8 +51,7 @@ def continuous_rows(dressing: Dressing, spec: TensorSpec) -> tuple[str, str, int
     return drawn, row(dressing.builder, dressing.own(without), width) if without in known else drawn, width
 
 
-@dataclass(frozen=True, slots=True)
-class Branches:
+class Branches(Struct, frozen=True):
     """The scores of a discrete action: log-probabilities or logits [B, n] per branch, and its samples where it draws.
 
     ``samples`` and ``best`` are int64 [B, branches], None where they have to be made of the scores.

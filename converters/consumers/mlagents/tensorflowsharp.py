@@ -10,6 +10,7 @@ it is log-probabilities that the C# side draws from. Noise is drawn in the graph
 from __future__ import annotations
 
 import numpy as np
+from msgspec import Struct
 
 from converters.consumers.mlagents import input_mapping as feeding
 from converters.consumers.mlagents.memory import action_columns, give_memory, previous_action, take_memory
@@ -26,13 +27,11 @@ from converters.consumers.mlagents.output_mapping import (
 from converters.graph.nodes import Node, TensorShape
 from converters.graph.types import BATCH, FLOAT32, INT32
 from converters.policy.policy import Policy
-from signatures.records import dataclass
 from signatures.roles import ACTION_SHAPE, IS_CONTINUOUS, MEMORY_SIZE, VERSION_NUMBER, Role
 from signatures.spec import TensorSpec
 
 
-@dataclass(frozen=True, slots=True)
-class Generation:
+class Generation(Struct, frozen=True):
     """What tells a generation from the others: names of observations, and what it knows."""
 
     name: str

@@ -12,9 +12,9 @@ and what the policy gives besides (BarracudaModelParamLoader.cs and TensorGenera
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
+from msgspec.structs import replace
 
 from converters.compiler.passes.broadcast_constants import broadcast_rows
 from converters.consumers.mlagents import input_mapping as feeding

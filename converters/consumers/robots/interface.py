@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from signatures.records import dataclass
+from msgspec import Struct
 
 #: TensorProto.DataType
 FLOAT = 1
 
 
-@dataclass(frozen=True, slots=True)
-class Tensor:
+class Tensor(Struct, frozen=True):
     """An input or output; in ``dims`` None is a free length."""
 
     name: str
@@ -24,8 +23,7 @@ class Tensor:
         return f"{self.name} [{', '.join('?' if d is None else str(d) for d in self.dims)}]"
 
 
-@dataclass(frozen=True, slots=True)
-class Interface:
+class Interface(Struct, frozen=True):
     """The inputs and outputs of a file, its opset of ONNX's own operators and its IR version."""
 
     inputs: tuple[Tensor, ...]

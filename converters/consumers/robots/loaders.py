@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
+from msgspec import Struct
+
 from converters.consumers.robots.interface import Interface
 from signatures.errors import ProfileError
-from signatures.records import dataclass
 
 _RNN = "leggedrobotics/rsl_rl@14d428d7 rsl_rl/models/rnn_model.py"
 _EXPORTER = "isaac-sim/IsaacLab@046b71b8 source/isaaclab_rl/isaaclab_rl/rsl_rl/exporter.py"
@@ -27,8 +28,7 @@ _ISAAC_INPUTS = {1: [OBS], 2: [OBS, HIDDEN[0]], 3: [OBS, HIDDEN[0], CELL[0]]}
 _ISAAC_OUTPUTS = {1: [ACTIONS], 2: [ACTIONS, HIDDEN[1]], 3: [ACTIONS, HIDDEN[1], CELL[1]]}
 
 
-@dataclass(frozen=True, slots=True)
-class LoaderRule:
+class LoaderRule(Struct, frozen=True):
     """``says`` is what the loader asks, ``holds`` whether a file meets it."""
 
     says: str
@@ -36,8 +36,7 @@ class LoaderRule:
     holds: Callable[[Interface], bool]
 
 
-@dataclass(frozen=True, slots=True)
-class Loader:
+class Loader(Struct, frozen=True):
     """A program that loads a policy as ONNX."""
 
     name: str

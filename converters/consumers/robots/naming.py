@@ -5,10 +5,10 @@ Both are deployed without chance: the mean of continuous actions, the scores of 
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
+from msgspec.structs import replace
 
 from converters.consumers.mlagents import input_mapping as feeding
 from converters.consumers.mlagents.naming import Dressing, row

@@ -8,10 +8,10 @@ LSTM becomes a memory that the runtime manages; where it is cut from an input di
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import field
 from typing import Any
 
 import numpy as np
+from msgspec import Struct, field
 
 from converters.consumers.mlagents.names import ACTION, CONTINUOUS, DISCRETE
 from converters.consumers.unity.consumers import Consumer
@@ -19,15 +19,13 @@ from converters.consumers.unity.findings import Thrown, UnityThrows, null_refere
 from converters.consumers.unity.model import CheckedModel, InputView, truncate
 from converters.consumers.unity.onnx_file import Dims, OnnxFile, attributes
 from converters.formats.barracuda.format import NnModel, four_axes
-from signatures.records import dataclass
 from signatures.roles import DISCRETE_SHAPE, MEMORY_SIZE, VERSION_NUMBER
 
 _TO_NCHW = (0, 3, 1, 2)
 _INITIAL_H = 5
 
 
-@dataclass(frozen=True)
-class BarracudaModel(CheckedModel):
+class BarracudaModel(CheckedModel, Struct, frozen=True):
     """A model in Barracuda; ``constants`` are those that can be found by name."""
 
     inputs: tuple[InputView, ...]
@@ -74,8 +72,7 @@ class BarracudaModel(CheckedModel):
         return super().fetched_outputs(deterministic)
 
 
-@dataclass(frozen=True)
-class EarlierModel(BarracudaModel):
+class EarlierModel(BarracudaModel, frozen=True):
     """A model in ML-Agents 1.x: a missing shape of actions is not expected, and memories are outputs of their own.
 
     ``action_alone``: no other output has actions. ``kept`` are the outputs that the memories are made of.

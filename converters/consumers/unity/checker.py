@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import field, replace
 from pathlib import Path
 from typing import Any, TypeVar
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from converters.consumers.unity import barracuda_model, importing, rules, sentis_model
 from converters.consumers.unity.assumed import assumed_brain, nn_ranks, onnx_ranks
@@ -24,7 +26,6 @@ from converters.formats.barracuda import format as nn_format
 from converters.formats.recognise import recognise_path
 from converters.formats.registry import BARRACUDA, ONNX
 from signatures.errors import ExportModelError, SourceError
-from signatures.records import dataclass
 
 #: Deterministic Inference of Behavior Parameters: off and on.
 MODES = {"stochastic": False, "deterministic": True}
@@ -34,8 +35,7 @@ _MAGIC = 255
 _Result = TypeVar("_Result")
 
 
-@dataclass(frozen=True, slots=True)
-class ModeVerdict:
+class ModeVerdict(Struct, frozen=True):
     """What happens with Deterministic Inference off, or on.
 
     ``load`` is what loading for running throws; ``checks`` the Inspector's list, in its order, and ``check_throws`` the
@@ -79,8 +79,7 @@ class ModeVerdict:
         }
 
 
-@dataclass(frozen=True, slots=True)
-class UnityVerdict:
+class UnityVerdict(Struct, frozen=True):
     """What one release says to one file with one set of Behavior Parameters.
 
     ``refused`` is what the import throws; ``modes`` is empty then. ``misread`` is what of the graph its importer takes

@@ -12,9 +12,9 @@ from enum import StrEnum
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
 
 from signatures.errors import DamagedFileError
-from signatures.records import dataclass
 
 #: The pseudo-operators that an output and an input of the model are listed as.
 OUTPUT, INPUT = "(output)", "(input)"
@@ -32,8 +32,7 @@ class Source(StrEnum):
     ABSENT = "absent"
 
 
-@dataclass(frozen=True, slots=True)
-class Operand:
+class Operand(Struct, frozen=True):
     """One operand: ``shape`` with None for a free length, None where it is not known; ``value`` of constants."""
 
     name: str
@@ -53,8 +52,7 @@ class Operand:
         return self.source in (Source.CONSTANT, Source.TURNED)
 
 
-@dataclass(frozen=True, slots=True)
-class Construct:
+class Construct(Struct, frozen=True):
     """A node: its operator and operands, and where in the model it stands."""
 
     name: str

@@ -10,9 +10,10 @@ from __future__ import annotations
 
 from enum import Enum
 
+from msgspec import Struct
+
 from converters.formats.registry import BARRACUDA, ONNX
 from signatures.errors import UsageError
-from signatures.records import dataclass
 
 
 class Engine(Enum):
@@ -30,8 +31,7 @@ class Checks(Enum):
     DETERMINISTIC = "2.3"
 
 
-@dataclass(frozen=True, slots=True)
-class Consumer:
+class Consumer(Struct, frozen=True):
     """A release and what tells it from the others.
 
     ``namespace`` stands in the text of a failed cast; ``strips_zero``: the importer takes ``:0`` from the end of

@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import Any
 
-from signatures.records import dataclass
+from msgspec import Struct
 
 
 class Severity(StrEnum):
@@ -16,8 +16,7 @@ class Severity(StrEnum):
     INFO = "info"
 
 
-@dataclass(frozen=True, slots=True)
-class Finding:
+class Finding(Struct, frozen=True):
     """One thing that is wrong: ``message`` in Unity's words where Unity says it, ``where`` it lies, how to mend it."""
 
     severity: Severity
@@ -35,8 +34,7 @@ def warning(message: str, where: str, fix: str) -> Finding:
     return Finding(Severity.WARNING, message, where, fix)
 
 
-@dataclass(frozen=True, slots=True)
-class Thrown:
+class Thrown(Struct, frozen=True):
     """An exception of Unity's: its C# class, its message, what in the file it comes from, how to mend it.
 
     ``worded`` is false where Unity's own words are not known; ``message`` then says what happens.

@@ -5,18 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 
+from msgspec import Struct
+
 from converters.consumers.unity.players import Outcome
 from converters.formats.barracuda.assemble import FLATTENS_ITSELF
 from converters.formats.barracuda.format import Layer, NnModel
 from converters.formats.barracuda.vocabulary import Activation, LayerType
-from signatures.records import dataclass
 
 #: Activations that go by the channels.
 _BY_CHANNELS = frozenset({Activation.SOFTMAX, Activation.LOG_SOFTMAX})
 
 
-@dataclass(frozen=True, slots=True)
-class LayerRow:
+class LayerRow(Struct, frozen=True):
     """A form of a layer, the consumers that trip over it, and what comes of it."""
 
     consumers: frozenset[str]

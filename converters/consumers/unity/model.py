@@ -6,9 +6,9 @@ from abc import abstractmethod
 from typing import ClassVar
 
 import numpy as np
+from msgspec import Struct
 
 from converters.consumers.mlagents.names import ACTION, CONTINUOUS, DETERMINISTIC, DISCRETE, RECURRENT_OUT
-from signatures.records import dataclass
 from signatures.roles import (
     ACTION_SHAPE,
     CONTINUOUS_SHAPE,
@@ -21,8 +21,7 @@ FIRST_VERSION, LAST_VERSION = 2, 3
 _MOST_NEGATIVE = -(1 << 31)
 
 
-@dataclass(frozen=True, slots=True)
-class InputView:
+class InputView(Struct, frozen=True):
     """An input as the checker reads it: lengths by Unity's names for axes, 0 or 1 for those the file leaves free.
 
     ``last`` is the length of the last axis as the runtime orders them.

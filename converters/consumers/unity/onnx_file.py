@@ -12,18 +12,17 @@ onnx 1.23). What cannot be told is left out.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import Struct, field
 
 from converters.files.fetch import read_bytes
 from converters.formats.onnx.messages import as_onnx_message
 from converters.formats.onnx.proto import array_of, decode_model, load_external
 from signatures.errors import DamagedFileError, ExportModelError
-from signatures.records import dataclass
 
 #: TensorProto.DataType that Sentis holds as floats; everything else is held as int.
 _FLOATS = frozenset({1, 10, 11, 16})
@@ -35,8 +34,7 @@ _LARGEST_ZEROS = 1 << 16
 Dims = tuple[int | None, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class DeclaredInput:
+class DeclaredInput(Struct, frozen=True):
     """An input that is no initializer. ``dims`` is None without a shape; in it, None is a free or named length."""
 
     name: str
@@ -44,8 +42,7 @@ class DeclaredInput:
     is_float: bool
 
 
-@dataclass(frozen=True)
-class OnnxFile:
+class OnnxFile(Struct, frozen=True, dict=True):
     """A model with what is asked of it again and again; ``model`` is the ModelProto.
 
     ``beside`` is the name of a tensor whose numbers lie in a file of their own, empty where there is none.

@@ -11,6 +11,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from enum import StrEnum
 
+from msgspec import Struct
+
 from converters.consumers.mlagents.names import (
     ACTION,
     CONTINUOUS,
@@ -27,7 +29,6 @@ from converters.consumers.mlagents.names import (
 from converters.consumers.unity import forms
 from converters.consumers.unity.consumers import CONSUMERS, Engine
 from converters.consumers.unity.scene import Port, Scene
-from signatures.records import dataclass
 from signatures.roles import MEMORY_SIZE
 
 #: Every observation that one of the agent's sensors is written into; every input but those of one number.
@@ -53,8 +54,7 @@ class Outcome(StrEnum):
     WARNS = "plays, with a warning"
 
 
-@dataclass(frozen=True, slots=True)
-class Row:
+class Row(Struct, frozen=True):
     """A form of an input or an output, and what comes of it; ``form`` says it in words.
 
     ``when`` tells the form. ``exception`` is the class and text in Unity's words, with fields of ``forms.fields``, and
@@ -71,8 +71,7 @@ class Row:
     exception: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Player:
+class Player(Struct, frozen=True):
     """The player of one release. ``absent`` is what it throws where an output that it fetches is not there.
 
     ``played`` says whether this very release was run, or its code read, or that of another release run in its place.

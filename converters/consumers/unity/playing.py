@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+from msgspec import Struct
+
 from converters.consumers.mlagents.names import ACTION, CONTINUOUS, DISCRETE, RECURRENT_OUT
 from converters.consumers.unity.findings import Thrown
 from converters.consumers.unity.forms import fields
@@ -12,13 +14,11 @@ from converters.consumers.unity.layers import trips
 from converters.consumers.unity.players import ANY, FED, OBSERVATION, ONE_NUMBER, PLAYERS, UNKNOWN, Outcome, Player, Row
 from converters.consumers.unity.rules import culture_key
 from converters.consumers.unity.scene import Port, Scene
-from signatures.records import dataclass
 
 _ABSENT = "mem_out_missing, cont_missing_drawn, disc_missing_drawn"
 
 
-@dataclass(frozen=True, slots=True)
-class Played:
+class Played(Struct, frozen=True):
     """One thing that comes of playing a model: ``exception`` in Unity's words where it throws, ``evidence`` the small
     models that it was measured with.
     """

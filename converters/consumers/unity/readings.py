@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from enum import StrEnum
 
 import numpy as np
+from msgspec import Struct
 
 from converters.consumers.unity.constructs import INPUT, OUTPUT, Construct, Model, Operand, Source
 from converters.consumers.unity.importers import (
@@ -27,7 +28,6 @@ from converters.consumers.unity.importers import (
     LATER,
     SENTIS,
 )
-from signatures.records import dataclass
 
 
 class Reading(StrEnum):
@@ -39,8 +39,7 @@ class Reading(StrEnum):
     LOST = "lost"  # an output of it cannot be fetched
 
 
-@dataclass(frozen=True, slots=True)
-class Rule:
+class Rule(Struct, frozen=True):
     """A form of some operators and what it comes to in some importers."""
 
     ops: tuple[str, ...]
@@ -51,8 +50,7 @@ class Rule:
     when: Callable[[Construct], bool] = lambda construct: True
 
 
-@dataclass(frozen=True, slots=True)
-class Misreading:
+class Misreading(Struct, frozen=True):
     """A construct of a model that an importer does not read rightly."""
 
     importer: str

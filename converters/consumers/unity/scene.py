@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 
+from msgspec import Struct
+
 from converters.consumers.mlagents.names import VECTOR, VISUAL
 from converters.consumers.unity.consumers import Consumer, Engine
 from converters.consumers.unity.model import FIRST_VERSION, CheckedModel, InputView
@@ -12,13 +14,11 @@ from converters.consumers.unity.onnx_file import Dims, OnnxFile
 from converters.consumers.unity.rules import observation
 from converters.consumers.unity.settings import Brain
 from converters.formats.barracuda.format import NnModel
-from signatures.records import dataclass
 
 _INTEGERS = frozenset({2, 3, 4, 5, 6, 7, 9, 12, 13})  # TensorProto.DataType
 
 
-@dataclass(frozen=True, slots=True)
-class Port:
+class Port(Struct, frozen=True):
     """An input or an output. ``dims`` has the batch first and None for a free length; it is None where nobody says it
     (outputs of a ``.nn``). ``view`` is there for inputs. ``sensor`` is the shape that is written into an observation.
     """
@@ -44,8 +44,7 @@ class Port:
         return math.prod(self.lengths)
 
 
-@dataclass(frozen=True)
-class Scene:
+class Scene(Struct, frozen=True):
     """A model, imported by a consumer, and the agent that it is to act for, in one mode of inference.
 
     ``fetched`` are the outputs that the player fetches. Of ``file`` and ``nn`` one is there.

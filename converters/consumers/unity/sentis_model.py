@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import field
 from functools import cached_property
 from itertools import zip_longest
 from typing import Any, ClassVar
 
 import numpy as np
+from msgspec import Struct, field
 
 from converters.consumers.mlagents.names import CONTINUOUS, DISCRETE
 from converters.consumers.unity.barracuda_model import trim_index
@@ -22,14 +22,12 @@ from converters.consumers.unity.consumers import Consumer
 from converters.consumers.unity.findings import Thrown, UnityThrows, null_reference
 from converters.consumers.unity.model import CheckedModel, InputView, truncate
 from converters.consumers.unity.onnx_file import Dims, OnnxFile, attributes
-from signatures.records import dataclass
 from signatures.roles import ACTION_SHAPE, CONTINUOUS_SHAPE, DISCRETE_SHAPE, IS_CONTINUOUS, MEMORY_SIZE, VERSION_NUMBER
 
 _SINGLE, _INT32 = "Single", "Int32"
 
 
-@dataclass(frozen=True)
-class SentisModel(CheckedModel):
+class SentisModel(CheckedModel, Struct, frozen=True, dict=True):
     """A model in Sentis; ``values`` are the outputs that are read as constants, with their type."""
 
     by_substring: ClassVar[bool] = True

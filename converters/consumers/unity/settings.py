@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import field
 from pathlib import Path
 from typing import Any
 
+from msgspec import Struct, field
+
 from converters.files.fetch import read_bytes
 from signatures.errors import UsageError
-from signatures.records import dataclass
 
 #: Class of a sensor by the number of its axes, where nobody names it.
 _CLASSES = {1: "VectorSensor", 2: "BufferSensor", 3: "CameraSensor"}
@@ -20,8 +20,7 @@ _MOST, _MOST_BYTES = 1024, 1 << 20
 _ACTIONS = "continuous:2, discrete:3,2 or continuous:2+discrete:3"
 
 
-@dataclass(frozen=True, slots=True)
-class Sensor:
+class Sensor(Struct, frozen=True):
     """One sensor: its C# class and name, which stand in messages, and its shape.
 
     ``shape`` is [n] (a vector), [a, b] (a BufferSensor: at most a entities of b numbers) or [C, H, W] (a camera).
@@ -43,8 +42,7 @@ class Sensor:
         return {"type": self.kind, "name": self.name, "shape": list(self.shape)}
 
 
-@dataclass(frozen=True, slots=True)
-class Brain:
+class Brain(Struct, frozen=True):
     """What Behavior Parameters say (Space Size, Stacked Vectors, Continuous Actions, Branch Sizes), and the sensors."""
 
     continuous: int = 0

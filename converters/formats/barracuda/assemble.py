@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
+from msgspec.structs import replace
 
 from converters.formats.barracuda.format import Dataset, Layer, NnInput, NnMemory, NnModel
 from converters.formats.barracuda.lower_base import Draft, NnBuilder

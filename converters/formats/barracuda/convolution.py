@@ -7,9 +7,9 @@ TensorFlow's SAME, −2 for the same with the odd element of padding in front.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
+from msgspec.structs import replace
 
 from converters.formats.barracuda.dense import add_bias
 from converters.formats.barracuda.layer_builder import LayerBuilder, Value

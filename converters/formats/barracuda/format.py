@@ -1,4 +1,4 @@
-"""The bytes of a ``.nn`` file to dataclasses: versions 15 to 20, every byte accounted for.
+"""The bytes of a ``.nn`` file to records: versions 15 to 20, every byte accounted for.
 
 Everything is little-endian; a *str* is an int32 length and that many characters, an *arr* an int32 count and as many
 int32. The order of the fields: version (int64), inputs, outputs, memories, layers, then the weights (one stream of
@@ -20,14 +20,13 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
-from dataclasses import field
 from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
+from msgspec import Struct
 
 from signatures.errors import DamagedFileError
-from signatures.records import dataclass
 
 VERSIONS = range(15, 21)
 #: The first version of each change; see the module.
@@ -42,16 +41,14 @@ Ints = tuple[int, ...]
 _Item = TypeVar("_Item")
 
 
-@dataclass(frozen=True, slots=True)
-class NnInput:
+class NnInput(Struct, frozen=True):
     """An input of the model; a shape has four entries (N, H, W, C) or eight, −1 where the length is free."""
 
     name: str
     shape: Ints
 
 
-@dataclass(frozen=True, slots=True)
-class NnMemory:
+class NnMemory(Struct, frozen=True):
     """A part of the recurrent state: ``input`` is fed with what ``output`` gave in the step before."""
 
     shape: Ints
@@ -59,8 +56,7 @@ class NnMemory:
     output: str
 
 
-@dataclass(frozen=True, slots=True)
-class Dataset:
+class Dataset(Struct, frozen=True):
     """A constant in the weight stream; ``offset`` and ``length`` count elements, not bytes."""
 
     name: str
@@ -70,8 +66,7 @@ class Dataset:
     length: int
 
 
-@dataclass(frozen=True, slots=True)
-class Layer:
+class Layer(Struct, frozen=True):
     """One layer. Its name is also that of its result; what the other fields mean depends on ``type``."""
 
     name: str
@@ -87,8 +82,7 @@ class Layer:
     datasets: tuple[Dataset, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class Trailer:
+class Trailer(Struct, frozen=True):
     """What only Unity's own writer adds after the weights.
 
     ``metadata`` came with version 18. Unity's loaders stop before it in an older file, so that what is there is for
@@ -102,8 +96,7 @@ class Trailer:
     metadata: tuple[tuple[str, str], ...] = ()
 
 
-@dataclass(frozen=True, eq=False)
-class NnModel:
+class NnModel(Struct, frozen=True, eq=False):
     """A ``.nn`` file. ``weights`` is float32 (halves are widened, which loses nothing); ``half`` says they were."""
 
     version: int

@@ -10,8 +10,10 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from functools import partial
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from converters.formats.barracuda.format import EIGHT_AXES, Layer, NnInput, NnModel, four_axes
 from converters.formats.barracuda.layer_builder import MAX_ELEMENTS, LayerBuilder, Value, node_name
@@ -21,7 +23,6 @@ from converters.formats.barracuda.vocabulary import LayerType, draws_in_model
 from converters.graph.nodes import Graph, NameScope
 from converters.graph.types import FLOAT32, INT32, INT64
 from signatures.errors import DamagedFileError, ExportModelError, SignatureError
-from signatures.records import dataclass
 from signatures.roles import ACTION_NAMES, ACTION_SHAPE, OUTPUT_NAMES, VERSION_NUMBER, Role
 
 MEMORY_IN, MEMORY_OUT = "recurrent_in", "recurrent_out"
@@ -30,8 +31,7 @@ _CLASSES = ("discrete_actions", "deterministic_discrete_actions")
 _INTEGER_ROLES = (Role.ACTION, Role.DETERMINISTIC)
 
 
-@dataclass(frozen=True, slots=True)
-class Reading:
+class Reading(Struct, frozen=True):
     """The graph of a file, and what was noticed on the way."""
 
     graph: Graph

@@ -12,13 +12,13 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 import numpy.typing as npt
+from msgspec import Struct
 
 from converters.formats.barracuda.format import Layer, four_axes
 from converters.formats.barracuda.vocabulary import layer_label
 from converters.graph.builder import Builder
 from converters.graph.nodes import NameScope, Node
 from signatures.errors import GraphError, UnsupportedOpError
-from signatures.records import dataclass
 
 #: N, H, W, C; N is None where it is the batch.
 Shape = tuple[int | None, int, int, int]
@@ -40,8 +40,7 @@ def with_length(shape: Shape, axis: int, length: int) -> Shape:
     return length if axis == 0 else shape[0], rest[0], rest[1], rest[2]
 
 
-@dataclass(frozen=True, slots=True)
-class Value:
+class Value(Struct, frozen=True):
     """A tensor: where it is, and its shape in the ``.nn``.
 
     ``constant`` are its numbers [N, H, W, C] where they are known; ``integer`` is the same tensor before a ``.nn``

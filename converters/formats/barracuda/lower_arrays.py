@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
+from msgspec.structs import replace
 
 from converters.formats.barracuda.lower_base import NnBuilder
 from converters.formats.barracuda.lower_values import Axes, Value, rows_first, usual_axes

@@ -7,10 +7,11 @@ import itertools
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
+from msgspec import Struct
+from msgspec.structs import replace
 
 from converters.formats.barracuda.lower_values import FREE, Array, Axes, Dims, Piece, Value, usual_axes
 from converters.formats.barracuda.vocabulary import Activation, C, LayerType, N
@@ -20,7 +21,6 @@ from converters.graph.shapes import Types
 from converters.graph.size_limits import MAX_MADE, Allowance
 from converters.graph.types import BATCH, Dim, TensorType
 from signatures.errors import UnsupportedOpError
-from signatures.records import dataclass
 
 #: Tensors that a tensor is joined from.
 MAX_PIECES = 1 << 10
@@ -29,8 +29,7 @@ NO_PADS = (0, 0, 0, 0)
 _UNFIT = re.compile(r"[^\x21-\x7e]")
 
 
-@dataclass(frozen=True, slots=True)
-class Draft:
+class Draft(Struct, frozen=True):
     """A layer before its constants have their places in the weights; ``data`` are they, each [N, H, W, C]."""
 
     name: str

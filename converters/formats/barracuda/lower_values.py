@@ -12,10 +12,10 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
+from msgspec import Struct
 
 from converters.formats.barracuda.vocabulary import C, N
 from converters.graph.types import BATCH, Dim
-from signatures.records import dataclass
 
 Array = npt.NDArray[np.float32]
 #: Where each axis of a tensor of the graph lies: N, H, W or C; None: nowhere, its length is 1.
@@ -26,8 +26,7 @@ Dims = tuple[int, int, int, int]
 FREE = -1
 
 
-@dataclass(frozen=True, slots=True)
-class Piece:
+class Piece(Struct, frozen=True):
     """Channels ``start`` to ``stop`` of the ``width`` that a layer, an input or a constant has."""
 
     name: str
@@ -41,8 +40,7 @@ class Piece:
         return self.stop - self.start == self.width
 
 
-@dataclass(frozen=True, slots=True)
-class Value:
+class Value(Struct, frozen=True):
     """A tensor of the graph.
 
     ``shape`` is the graph's, with ``BATCH`` for the batch. Either ``array`` holds its numbers (of that shape, length 1

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+
+from msgspec.structs import replace
 
 from converters.formats.barracuda.format import Layer, NnModel
 from converters.formats.barracuda.vocabulary import Activation, LayerType

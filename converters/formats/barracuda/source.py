@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from msgspec.structs import replace
 
 from converters.files.fetch import Fetched
 from converters.formats.barracuda.format import NnModel, parse

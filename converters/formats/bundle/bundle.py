@@ -7,9 +7,11 @@ import errno
 import json
 import stat
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import field, replace
 from pathlib import Path
 from typing import Any, TypeAlias
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from converters.files.fetch import inside
 from converters.formats.bundle.embed import contract_text, without_contract
@@ -22,7 +24,6 @@ from signatures.contract import PARITY, POLICY, Contract, FileEntry, json_of, pa
 from signatures.digest import sha256_of_file
 from signatures.errors import BundleError, UsageError
 from signatures.fields import FieldError
-from signatures.records import dataclass
 from signatures.spec import PolicySignature
 
 #: Tensor → what its artefact says of it: dtype and shape.
@@ -52,8 +53,7 @@ def other_folders_in(place: Path) -> tuple[list[Path], list[Path]]:
     return [p for p in others if (p / PARITY).is_file()], [p for p in others if not (p / PARITY).is_file()]
 
 
-@dataclass(frozen=True)
-class Bundle:
+class Bundle(Struct, frozen=True):
     """A folder that this tool wrote, with what its policy.json says."""
 
     folder: Path

@@ -8,10 +8,10 @@ own: it is the source now, and the original that the result is compared with.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from msgspec.structs import replace
 
 from converters.compiler.passes.normalise import normalise
 from converters.compiler.passes.signature import derived_notes

@@ -7,10 +7,11 @@ slots of an optimizer make up most of a checkpoint, and nothing that a policy co
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
 
 from converters.files import tensorflow_messages as schema
 from converters.files.external_data import Detached
@@ -21,7 +22,6 @@ from converters.graph.nodes import Graph, NameScope, Node, node_of, topological
 from converters.graph.ops.table import EFFECTS, VARIABLES, hands_on
 from converters.policy.brains import depends_on_input, find_brains
 from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError
-from signatures.records import dataclass
 from signatures.roles import CONSTANT_NAMES
 
 _IN_A_CHECKPOINT = "it is the graph that training started from; the values are in a checkpoint, and none lies beside it"
@@ -49,8 +49,7 @@ def is_effect(node: Node) -> bool:
     return node.op.startswith(EFFECTS)
 
 
-@dataclass(frozen=True)
-class Frozen:
+class Frozen(Struct, frozen=True):
     """A graph with its variables' values, and these by the variables' nodes."""
 
     graph: Graph

@@ -16,10 +16,10 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 
-from signatures.records import dataclass
+from msgspec import Struct
+from msgspec.structs import replace
 
 RAW_GRAPH, FROZEN_GRAPH, LIST = "raw_graph_def.pb", "frozen_graph_def.pb", "checkpoint"
 #: Final exports, the one that is taken first: graphs hold most, and an ONNX has a runtime of its own to be verified in.
@@ -30,8 +30,7 @@ _STEP = re.compile(r"(?P<name>.+)-(?P<step>\d{1,18})(?:\.[A-Za-z]\w*)?")
 _NOT_EXPORTS = (RAW_GRAPH, "saved_model.pb", "keras_metadata.pb", "fingerprint.pb")
 
 
-@dataclass(frozen=True, slots=True)
-class Kept:
+class Kept(Struct, frozen=True):
     """What training kept at a step: an export, or a checkpoint's index (``prefix`` is its path without ``.index``)."""
 
     path: Path
@@ -53,8 +52,7 @@ class Kept:
         return self.prefix.name if self.suffix == ".index" else self.path.name
 
 
-@dataclass(frozen=True)
-class Behavior:
+class Behavior(Struct, frozen=True):
     """One policy of a run, in the forms it was kept in."""
 
     name: str

@@ -8,12 +8,12 @@ and length per axis; saver.py, checkpoint_ops.cc). Where there is no saver, a va
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import field
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from msgspec import Struct, field
 
 from converters.files import tensorflow_messages as schema
 from converters.files.external_data import Detached
@@ -24,19 +24,16 @@ from converters.formats.frozen_graph.tensors import to_array
 from converters.graph.nodes import Graph, node_of, split_ref
 from converters.graph.ops.table import ASSIGNS, RESTORES
 from signatures.errors import DamagedFileError, NotAPolicyError
-from signatures.records import dataclass
 
 
-@dataclass(frozen=True, slots=True)
-class Saved:
+class Saved(Struct, frozen=True):
     """Where a variable's value is in a checkpoint: a tensor, or a part of one."""
 
     key: str
     extents: Extents | None = None
 
 
-@dataclass(frozen=True)
-class TrainingGraph:
+class TrainingGraph(Struct, frozen=True):
     """A graph with variables, and where their values are kept (for those that the graph's saver names)."""
 
     graph: Graph

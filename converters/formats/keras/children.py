@@ -12,16 +12,15 @@ import json
 from pathlib import Path
 
 import numpy as np
+from msgspec import Struct
 
 from converters.files.children.process import RunFailedError, RuntimeProcess
 from converters.files.children.python import child_command, module_origin
 from converters.formats.saved_model.signature import ModelSignature, signature_of
 from signatures.errors import DamagedFileError, RuntimeUnavailableError, SourceError
-from signatures.records import dataclass
 
 
-@dataclass(frozen=True)
-class Stored:
+class Stored(Struct, frozen=True):
     """What an HDF5 file of Keras holds: (layer, name) → array, in its order, what an ``.h5`` says of itself, and
     the first names in it.
     """

@@ -7,20 +7,20 @@ Three spellings are one form here: Keras 2 and TensorFlow.js (``inbound_nodes: [
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import field, replace
 from typing import Any
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from converters.compiler.passes.unroll import MAX_NODES
 from converters.graph.nodes import NameScope
 from signatures.errors import DamagedFileError, NotAPolicyError
-from signatures.records import dataclass
 
 #: Classes that are models themselves.
 MODELS = frozenset(("Functional", "Model", "Sequential"))
 
 
-@dataclass(frozen=True, slots=True)
-class Place:
+class Place(Struct, frozen=True):
     """The ``tensor``-th result of the ``call``-th call of a layer."""
 
     layer: str
@@ -28,16 +28,14 @@ class Place:
     tensor: int
 
 
-@dataclass(frozen=True, slots=True)
-class LayerCall:
+class LayerCall(Struct, frozen=True):
     """One call of a layer: its arguments, ``Place`` where they are tensors."""
 
     args: tuple[Any, ...]
     kwargs: Mapping[str, Any] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class Layer:
+class Layer(Struct, frozen=True):
     """A layer by its class and settings; ``model`` is what it holds where it is a model itself."""
 
     kind: str
@@ -49,8 +47,7 @@ class Layer:
     operation: bool = False
 
 
-@dataclass(frozen=True)
-class LayeredModel:
+class LayeredModel(Struct, frozen=True):
     """Layers and their calls; ``outputs`` are keyed by what the model calls them."""
 
     name: str

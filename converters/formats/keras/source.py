@@ -7,9 +7,10 @@ They are read as data. What is more than the layers of ``layers/table.py`` is le
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+from msgspec.structs import replace
 
 from converters.files import tensorflow_messages as schema
 from converters.files.fetch import Fetched

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
+from msgspec import Struct
 
 from converters.compiler.options import MAX_PORTS
 from converters.formats.bundle.embed import contract_of
@@ -25,7 +26,6 @@ from converters.graph.nodes import Graph, TensorShape
 from converters.graph.types import INT64
 from signatures.contract import EMBEDDED, Contract
 from signatures.errors import NotAPolicyError
-from signatures.records import dataclass
 
 #: The signature that is read where a file has several, as TensorFlow calls the one of a model that is served.
 SERVING = "serving_default"
@@ -33,8 +33,7 @@ SERVING = "serving_default"
 _SERVED = f"{SERVING}_"
 
 
-@dataclass(frozen=True)
-class LitertModel:
+class LitertModel(Struct, frozen=True):
     """A file as it was read.
 
     ``tensors`` and ``ports`` are the numbers of tensors by name, and by what a caller calls them, for who runs the file

@@ -9,8 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-
-from signatures.records import dataclass
+from msgspec import Struct
 
 #: ``Model.version``, and what stands in bytes 4 to 8 of a file.
 VERSION, IDENTIFIER = 3, b"TFL3"
@@ -226,8 +225,7 @@ ZEROS_LIKE 93 - fil
 """
 
 
-@dataclass(frozen=True, slots=True)
-class Builtin:
+class Builtin(Struct, frozen=True):
     """An operator; see ``_BUILTINS``."""
 
     code: int
@@ -293,8 +291,7 @@ OPERATOR_NAMES: Mapping[int, str] = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Field:
+class Field(Struct, frozen=True):
     """A field of a table: its slot, what it holds, and what it is where the file does not say."""
 
     name: str

@@ -8,14 +8,14 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
+from msgspec import Struct
+
 from converters.graph.ops.table import FUNCTIONAL
-from signatures.records import dataclass
 
 TypedTensor = tuple[str, str, list[int | None] | None]
 
 
-@dataclass(frozen=True)
-class FrozenFunction:
+class FrozenFunction(Struct, frozen=True):
     """A flat GraphDef, and which of its tensors are the function's arguments and results, by their names.
 
     A tensor is its name, its dtype's, and its shape (None: unknown) with None for a free axis.

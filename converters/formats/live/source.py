@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from msgspec import Struct
+
 from converters.formats.format import Format
 from converters.formats.live.functions import read_function, read_keras
 from converters.formats.live.session import read_session
@@ -14,7 +16,6 @@ from converters.formats.source import SourceModel
 from converters.graph.nodes import Graph
 from signatures.digest import sha256_hex
 from signatures.errors import UsageError
-from signatures.records import dataclass
 
 _KINDS = {
     "session": (Format(key="session", label="a live session"), read_session),
@@ -23,8 +24,7 @@ _KINDS = {
 }
 
 
-@dataclass(frozen=True)
-class Live:
+class Live(Struct, frozen=True):
     """What was read of a live object. ``sha256`` and ``size`` (bytes) are those of its frozen graph."""
 
     format: Format

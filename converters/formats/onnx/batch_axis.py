@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
 
 from converters.compiler.passes.vmap import for_every_row
 from converters.compiler.passes.vmap_trial import ROWS, check_rows, too_large
@@ -22,7 +23,6 @@ from converters.graph.nodes import Graph
 from converters.graph.shapes import Types, infer_types
 from converters.graph.size_limits import MAX_COMPUTED
 from signatures.errors import ExportModelError, NotAPolicyError, SignatureError
-from signatures.records import dataclass
 
 #: Numbers that a model with a fixed batch may take at a time (32 MiB).
 _MAX_FED = 1 << 23
@@ -30,8 +30,7 @@ _MAX_FED = 1 << 23
 Dims = tuple[int | None, ...] | None
 
 
-@dataclass(frozen=True)
-class Reading:
+class Reading(Struct, frozen=True):
     """A model as it is read. ``batch`` is the number of rows that the file itself takes, None: any; ``alone``: it was
     made for one agent, and the graph computes each agent's row by itself.
     """

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import field
 from typing import Any
+
+from msgspec import Struct, field
 
 from converters.formats.onnx.importer.node import STANDARD
 from converters.formats.onnx.importer.table import TABLE
@@ -14,7 +15,6 @@ from converters.formats.onnx.messages import as_onnx_message
 from converters.formats.onnx.proto import bodies
 from converters.graph.builder import MAX_NODES
 from signatures.errors import DamagedFileError, UnsupportedOpError
-from signatures.records import dataclass
 
 #: Opsets that are read. Before 7 broadcasting was an attribute of each op.
 FIRST_OPSET = 7
@@ -110,8 +110,7 @@ def _complete(nodes: Sequence[Any], defaults: Mapping[str, Sequence[Any]]) -> No
         node.attribute.extend(a for a in defaults.get(_identity(node, node.op_type), ()) if a.name not in given)
 
 
-@dataclass
-class _Load:
+class _Load(Struct):
     """What a body unfolds to: nodes (a call is one, too), bytes that are copied, names of values.
 
     ``reads`` is how often it takes an attribute of the function that it is part of.

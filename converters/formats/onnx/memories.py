@@ -9,12 +9,12 @@ Operands and outputs by position: onnx/docs/Operators.md (LSTM, GRU).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import field
 from typing import Any
+
+from msgspec import Struct, field
 
 from converters.formats.onnx.importer.node import STANDARD
 from converters.policy.rules import Decision, Rule, always, first
-from signatures.records import dataclass
 from signatures.roles import Role
 
 Dims = tuple[int | None, ...] | None
@@ -33,8 +33,7 @@ _RESETS: Mapping[str, int | None] = {"Mul": None, "Where": None}
 _MOST = 64
 
 
-@dataclass(frozen=True, slots=True)
-class OnnxMemory:
+class OnnxMemory(Struct, frozen=True):
     """An input and the output that is fed back to it, ``part`` h or c; the batch is the input's axis ``axis``."""
 
     input: str
@@ -43,8 +42,7 @@ class OnnxMemory:
     axis: int
 
 
-@dataclass(frozen=True, slots=True)
-class Start:
+class Start(Struct, frozen=True):
     """An input that recurrent layers begin with: (layer, part) of each, the outputs that give the last of the same
     states and may have its shape, and its batch axis, where they tell it.
     """
@@ -73,8 +71,7 @@ _RULES: tuple[Rule[Start, Role | None], ...] = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class FoundMemories:
+class FoundMemories(Struct, frozen=True):
     """The memories in the order of the inputs, input → its batch axis, and input → what was decided of it.
 
     There are no memories where it is not plain for each of them which output belongs to it; the states of several

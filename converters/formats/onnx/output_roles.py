@@ -5,11 +5,12 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 
+from msgspec import Struct
+
 from converters.formats.onnx.reader import OnnxModel
 from converters.graph.types import Dim
 from converters.policy.action_values import is_q_name
 from converters.policy.rules import Decision, Rule, against, first
-from signatures.records import dataclass
 from signatures.roles import OUTPUT_NAMES, STATE_VALUE_NAMES, Role
 
 #: What other trainers call the action and the value: rsl_rl (actions), Stable-Baselines3, CleanRL, plain PyTorch.
@@ -21,8 +22,7 @@ _LOG_STD = re.compile(r"(action_?)?log_?(std|stddev|std_dev|sigma|scale)s?")
 _LOG_PROB = re.compile(r"(action_?)?log_?probs?")
 
 
-@dataclass(frozen=True, slots=True)
-class Output:
+class Output(Struct, frozen=True):
     """An output's node, the last part of its name in small letters, its shape, and how wide the action is."""
 
     node: str

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from converters.files.external_data import Detached
 from converters.files.fetch import Fetched
@@ -26,7 +27,6 @@ from converters.policy.memories import looks_like_state
 from converters.policy.rules import Decision
 from signatures.errors import DamagedFileError, NotAPolicyError, UnsupportedOpError
 from signatures.memories import SeparateMemory
-from signatures.records import dataclass
 from signatures.roles import ACTION_NAMES, CONSTANT_NAMES
 
 _FLOAT, _DOUBLE = 1, 11
@@ -35,8 +35,7 @@ _INT = 2  # AttributeProto.AttributeType
 _SEQUENCE_LENGTH = "sequence_length"
 
 
-@dataclass(frozen=True)
-class OnnxModel:
+class OnnxModel(Struct, frozen=True):
     """A model as it was read.
 
     ``inputs`` and ``outputs`` map the model's values to nodes of the graph, in the file's order. ``draws`` are the

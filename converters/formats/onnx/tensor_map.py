@@ -10,18 +10,17 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import field
 from typing import Any
+
+from msgspec import Struct, field
 
 from converters.formats.intermediate_tensors import View
 from signatures import bounded
-from signatures.records import dataclass
 
 TENSORS_KEY = "export_model_tensors"
 
 
-@dataclass(frozen=True)
-class TensorMap:
+class TensorMap(Struct, frozen=True):
     """What is called otherwise; see the module."""
 
     values: Mapping[str, View | None] = field(default_factory=dict)

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
+from msgspec.structs import replace
 
 from converters.formats.bundle.embed import contract_of, redrawn
 from converters.formats.bundle.embed import facts_of as facts_of_contract

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from msgspec import Struct
+
 from converters.graph.language import identifier
 from converters.graph.nodes import NameScope
 from signatures.code import CodeOptions
 from signatures.errors import UnsupportedOpError
-from signatures.records import dataclass
 from signatures.roles import Role
 from signatures.spec import PolicySignature, TensorSpec
 
@@ -27,8 +28,7 @@ _KEYWORDS = tuple(
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Field:
+class Field(Struct, frozen=True):
     """A member of one of the header's structs: ``size`` elements of a tensor of the policy."""
 
     name: str
@@ -36,8 +36,7 @@ class Field:
     size: int
 
 
-@dataclass(frozen=True, slots=True)
-class Header:
+class Header(Struct, frozen=True):
     """The members: what is observed, what the memory keeps (the state, draws), what is answered."""
 
     prefix: str

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 import numpy as np
+from msgspec import Struct
 
 from converters.compiler.targets import PROGRAM, prepare
 from converters.formats.format import WriteOptions
@@ -19,7 +20,6 @@ from converters.policy.policy import Policy
 from signatures.code import CodeOptions
 from signatures.contract import EMBEDDED
 from signatures.errors import GraphError, UsageError
-from signatures.records import dataclass
 from signatures.roles import Role
 
 #: Golden rows of the self test, and how far float32 may be off.
@@ -27,8 +27,7 @@ ROWS = 3
 CLOSE = "1e-4"
 
 
-@dataclass(frozen=True, slots=True)
-class Guarded:
+class Guarded(Struct, frozen=True):
     """An observation's mean in training, number by number, and how far from it is usual."""
 
     field: Field
@@ -36,8 +35,7 @@ class Guarded:
     limit: tuple[float, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Plan:
+class Plan(Struct, frozen=True):
     """The loops of a policy and its members.
 
     ``contract`` is the text of a comment. ``chosen`` is the output that classes are drawn by, ``sizes`` its branches.

@@ -6,15 +6,14 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterator, Mapping
-from dataclasses import field
 
 import numpy as np
+from msgspec import Struct, field
 
 from converters.compiler.passes.weights import Storage, compact
 from converters.graph.ops.loops.base import Element, Expression, Tensor, apply, number
 from converters.graph.program import Place, Program, elements, inline_scalars
 from converters.graph.types import BOOL, FLOAT32, INT64
-from signatures.records import dataclass
 
 #: dtypes of constants that stay in the source: each language holds them in its own way.
 _IN_SOURCE = (BOOL, INT64)
@@ -28,8 +27,7 @@ def weights_name(policy: str) -> str:
     return WEIGHTS.format(name=policy)
 
 
-@dataclass(frozen=True, eq=False)
-class Kept:
+class Kept(Struct, frozen=True, eq=False):
     """A constant: ``narrow`` is it, or it in fewer bytes; ``step`` what that is multiplied by, one for each channel.
 
     ``axis`` is that of the channels. ``offsets`` are in the file, if it is there.
@@ -48,8 +46,7 @@ class Kept:
         return int(np.prod(self.narrow.value.shape[self.axis + 1 :], dtype=np.int64))
 
 
-@dataclass(frozen=True, eq=False)
-class Weights:
+class Weights(Struct, frozen=True, eq=False):
     """All constants of a program, in its order, and the file (None: they are in the source)."""
 
     kept: tuple[Kept, ...]

@@ -5,10 +5,10 @@ policy looks at says that, too, and nobody has to feed what nothing depends on.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from msgspec.structs import replace
 
 from converters.files.tensorflow_messages import dtype_number, node_def
 from converters.formats.frozen_graph.tensors import constant

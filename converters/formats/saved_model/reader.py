@@ -7,8 +7,9 @@ the signatures call functions of the graph's library (converters/formats/saved_m
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import field
 from typing import Any
+
+from msgspec import Struct, field
 
 from converters.compiler.options import MAX_PORTS
 from converters.files import tensorflow_messages as schema
@@ -17,14 +18,12 @@ from converters.formats.saved_model.signature import ModelSignature, Tensor
 from converters.graph.nodes import TensorShape, node_of, reachable
 from converters.graph.ops.table import CALLING
 from signatures.errors import DamagedFileError, NotAPolicyError
-from signatures.records import dataclass
 
 SERVING = "serving_default"
 _INIT = "__saved_model_"
 
 
-@dataclass(frozen=True)
-class Saved:
+class Saved(Struct, frozen=True):
     """One MetaGraph of a SavedModel, and the signature that stands for the policy."""
 
     graph_def: Any

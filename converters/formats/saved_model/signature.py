@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import field
 from typing import Any
 
 import numpy as np
+from msgspec import Struct, field
 
 from converters.compiler.options import MAX_PORTS
 from converters.files.tensorflow_messages import dtype_number
@@ -39,7 +39,6 @@ from signatures.contract import EMBEDDED
 from signatures.dtypes import DATA_TYPES
 from signatures.errors import DamagedFileError, NotAPolicyError
 from signatures.memories import SeparateMemory
-from signatures.records import dataclass
 from signatures.roles import ACTION_NAMES, CANONICAL, CONSTANT_NAMES, OUTPUT_NAMES, Role
 
 _Q_VALUES = CANONICAL[Role.Q_VALUES]
@@ -47,8 +46,7 @@ _Q_VALUES = CANONICAL[Role.Q_VALUES]
 _NUMBERS = frozenset(t.dtype.name for t in DATA_TYPES)
 
 
-@dataclass(frozen=True, slots=True)
-class Tensor:
+class Tensor(Struct, frozen=True):
     """One entry of a signature."""
 
     name: str
@@ -56,8 +54,7 @@ class Tensor:
     shape: TensorShape = field(default_factory=lambda: TensorShape(None))
 
 
-@dataclass(frozen=True)
-class ModelSignature:
+class ModelSignature(Struct, frozen=True):
     """Key → tensor of the inputs and of the outputs; ``key`` is what the signature itself is called."""
 
     inputs: Mapping[str, Tensor] = field(default_factory=dict)

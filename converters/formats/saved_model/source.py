@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from converters.files.fetch import Fetched, read_bytes
 from converters.files.file_probe import Content
@@ -22,7 +24,6 @@ from converters.formats.saved_model.signature import ModelSignature, expose_sign
 from converters.formats.source import OriginalRun, ReadOptions, SourceModel
 from converters.graph.nodes import Graph, node_of
 from signatures.errors import NotAPolicyError
-from signatures.records import dataclass
 
 FILE = "saved_model.pb"
 _WITHOUT_VARIABLES = (
@@ -54,8 +55,7 @@ def embedded_contract(folder: Path) -> str | None:
     return contract_text(from_graph_def(saved.graph_def, saved.detached))
 
 
-@dataclass(frozen=True)
-class FrozenModel:
+class FrozenModel(Struct, frozen=True):
     """A SavedModel without functions and variables: its graph, its definition, its signature on these.
 
     ``files`` are those that the variables' values were read from.

@@ -7,9 +7,10 @@ then loads is a SavedModel of that graph with the signatures asked for: no funct
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+from msgspec.structs import replace
 
 from converters.files import tensorflow_messages as schema
 from converters.files.external_data import Detached

@@ -8,9 +8,10 @@ disk; what its two entries may unfold to is bounded by the file.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+from msgspec.structs import replace
 
 from converters.files.fetch import Fetched
 from converters.files.file_probe import json_in

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
 
 from converters.files import tensorflow_messages as schema
 from converters.files.fetch import Fetched, inside, read_bytes
@@ -24,7 +25,6 @@ from converters.formats.saved_model.signature import ModelSignature, Tensor
 from converters.graph.nodes import Graph, Node, TensorShape, normal_ref, topological
 from converters.graph.ops.table import IFS, WHILES, is_fed
 from signatures.errors import DamagedFileError, NotAPolicyError, SourceError
-from signatures.records import dataclass
 
 MODEL = "model.json"
 _NAMES = ("float32", "int32", "bool", "uint8", "uint16", "float16", "int64")
@@ -35,8 +35,7 @@ _MAX_FILES, _HEAD = 16, 1 << 16
 _FIX = "copy the model again: model.json and all the .bin files beside it"
 
 
-@dataclass(frozen=True)
-class WebModel:
+class WebModel(Struct, frozen=True):
     """What a model.json and its shards hold."""
 
     graph: Graph

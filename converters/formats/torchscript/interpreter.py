@@ -11,12 +11,13 @@ import ast
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
+from msgspec import Struct
+
 from converters.formats.torchscript.code import Code
 from converters.formats.torchscript.machine import Machine
 from converters.formats.torchscript.ops.table import OPS
 from converters.formats.torchscript.values import Module, Named, Tensor
 from signatures.errors import DamagedFileError, ExportModelError, SourceError, UnsupportedOpError
-from signatures.records import dataclass
 
 #: Statements that are walked through; a policy has some hundreds, loops included.
 MAX_STATEMENTS = 100_000
@@ -29,8 +30,7 @@ _FIX = "export the module to ONNX in its own project (torch.onnx.export), and gi
 _NESTED = "expressions in one another"
 
 
-@dataclass
-class _Frame:
+class _Frame(Struct):
     """A call that is being walked through."""
 
     names: dict[str, Any]

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from msgspec import Struct
+
 from converters.files.pickled_objects import Instance
 from signatures.errors import UnsupportedOpError
-from signatures.records import dataclass
 
 #: Of the whole, what a view shows; of the whole and a new view, the new whole.
 Show = Callable[[str], str]
@@ -64,8 +65,7 @@ class View(Tensor):
         return self._whole.version
 
 
-@dataclass(frozen=True, slots=True)
-class Module:
+class Module(Struct, frozen=True):
     """A module of the program: its attributes, and where it is (``actor.0``)."""
 
     instance: Instance
@@ -77,20 +77,17 @@ class Module:
         return f"{self.instance.maker.module}.{self.instance.maker.name}"
 
 
-@dataclass(frozen=True, slots=True)
-class Named:
+class Named(Struct, frozen=True):
     """Something that is called by a dotted name: an op (``torch.relu``), a function of the program."""
 
     name: str
 
 
-@dataclass(frozen=True, slots=True)
-class Device:
+class Device(Struct, frozen=True):
     """Where a tensor would lie, which makes no difference here."""
 
 
-@dataclass(frozen=True, slots=True)
-class OpenLength:
+class OpenLength(Struct, frozen=True):
     """The length of an input's axis that is not known yet, as a number of the program: it may be compared."""
 
     symbol: str

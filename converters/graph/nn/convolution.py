@@ -8,22 +8,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
 
 from converters.graph.builder import Builder
 from converters.graph.ops.loops.layers import window_padding
 from signatures.errors import UnsupportedOpError
-from signatures.records import dataclass
 
 MAX_GROUPS = 256
 Pair = tuple[int, int]
 
 
-@dataclass(frozen=True, slots=True)
-class Window:
+class Window(Struct, frozen=True):
     """A window that slides over height and width; ``same``: as TensorFlow pads, whatever ``pads`` says."""
 
     size: Pair

@@ -11,12 +11,12 @@ from collections.abc import Callable
 
 import numpy as np
 import numpy.typing as npt
+from msgspec import Struct
 
 from converters.graph.builder import Builder
 from converters.graph.nn.choosing import last, moved_back
 from converters.graph.nn.linear import matmul
 from signatures.errors import UnsupportedOpError
-from signatures.records import dataclass
 
 Places = npt.NDArray[np.float32]
 Weights = npt.NDArray[np.float64]
@@ -24,8 +24,7 @@ _MAX_WEIGHTS = 1 << 22
 _WHOLE = 1e-4
 
 
-@dataclass(frozen=True, slots=True)
-class Resampling:
+class Resampling(Struct, frozen=True):
     """How, by ONNX's names; ``region`` is what tf_crop_and_resize takes of the axis, from 0 to 1."""
 
     mode: str = "nearest"

@@ -11,13 +11,13 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Literal, Protocol
 
 import numpy as np
+from msgspec import Struct
 
 from converters.graph.nodes import Node
 from converters.graph.ops.litert.base import Litert
 from converters.graph.ops.loops.base import Loops
 from converters.graph.types import INT64, Dim, Symbols, TensorType, broadcast
 from signatures.errors import GraphError, UnsupportedOpError
-from signatures.records import dataclass
 
 Kernel = Callable[..., Any]
 Infer = Callable[[Node, Sequence[TensorType], Symbols], Sequence[TensorType]]
@@ -102,8 +102,7 @@ Older = Callable[[GraphBuilder, Node], str]
 Tfjs = Callable[[GraphBuilder, Node, Mapping[str, TensorType]], Node]
 
 
-@dataclass(frozen=True, slots=True)
-class Decomposition:
+class Decomposition(Struct, frozen=True):
     """A node in ops that every Barracuda computes rightly: ``write`` adds nodes and returns the one in its place.
 
     ``onnx`` is the ONNX op that the node becomes otherwise: decomposed for importers that lack or misread it (``""``:
@@ -134,8 +133,7 @@ Operand = Literal["", "factor", "divisor", "summand", "subtrahend"]
 Finite = Literal["", "always", "as its operands"]
 
 
-@dataclass(frozen=True, slots=True)
-class Attr:
+class Attr(Struct, frozen=True):
     """An attribute as a GraphDef has it.
 
     ``derive`` says how the writers compute it (``"in:0"``: the dtype of input 0; ``"out:0"``; ``"count"``: the number
@@ -152,8 +150,7 @@ class Attr:
     supported: bool = True
 
 
-@dataclass(frozen=True, slots=True)
-class _Entry:
+class _Entry(Struct, frozen=True):
     """What an entry says in the order in which it says it; all else of an ``OpDef`` is named."""
 
     name: str
@@ -163,8 +160,7 @@ class _Entry:
     attrs: tuple[Attr, ...] = ()
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class OpDef(_Entry):
+class OpDef(_Entry, frozen=True, kw_only=True):
     """One op of the table; see the module's docstring."""
 
     #: -1: as many as the node says.

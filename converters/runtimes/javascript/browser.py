@@ -10,10 +10,11 @@ from __future__ import annotations
 import os
 import shutil
 import sys
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from msgspec.structs import replace
 
 from converters.runtimes.base import Runtime, RuntimeInfo
 from converters.runtimes.javascript.node import (

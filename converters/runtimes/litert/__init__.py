@@ -1,7 +1,8 @@
 """LiteRT: with XNNPACK, as it comes and as phones run it, and with its own kernels alone, as boards do."""
 
-from dataclasses import replace
 from functools import partial
+
+from msgspec.structs import replace
 
 from converters.runtimes.packages import package_runtime
 

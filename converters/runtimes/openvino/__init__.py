@@ -1,6 +1,6 @@
 """OpenVINO: another reader of ONNX, on request: it takes 180 MB, and a fifth of a second to compile a model."""
 
-from dataclasses import replace
+from msgspec.structs import replace
 
 from converters.runtimes.packages import package_runtime
 

@@ -13,16 +13,16 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
+from msgspec import Struct
+
 from converters.runtimes.installed import cache_folder
-from signatures.records import dataclass
 
 API_LIBRARY = "_pywrap_tensorflow_internal.so"
 #: The API library finds the other one beside itself (RUNPATH $ORIGIN).
 LIBRARIES = ("libtensorflow_framework.so", API_LIBRARY)
 
 
-@dataclass(frozen=True)
-class Release:
+class Release(Struct, frozen=True):
     """A version, and the sha256 of its wheel for CPython 3.6, manylinux1, x86-64."""
 
     runtime: str

@@ -23,6 +23,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from msgspec import Struct
 
 from converters.graph.nn.activations import clip, leaky_relu, swish
 from converters.graph.nodes import Graph
@@ -36,7 +37,6 @@ from converters.trainers.pytorch.activations import LEAKY_SLOPE
 from converters.trainers.pytorch.network import Network
 from converters.trainers.pytorch.weights import pytorch_alone
 from signatures.errors import SourceError
-from signatures.records import dataclass
 from signatures.roles import (
     ACTION_SHAPE,
     CONTINUOUS_SHAPE,
@@ -58,8 +58,7 @@ _FACTS = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class _Generation:
+class _Generation(Struct, frozen=True):
     """Where things are in the state dictionary, and which versions put them there."""
 
     span: str

@@ -10,11 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
+from msgspec import Struct
+
 from converters.policy.rules import Rule, first
 from converters.trainers.mlagents.state import LET_IT_EXPORT
 from converters.trainers.pytorch.weights import Weights
 from signatures.errors import SourceError, UsageError
-from signatures.records import dataclass
 
 #: Larger sides are not looked for.
 _LONGEST = 1024
@@ -23,8 +24,7 @@ _MOST_SENSORS = 16
 _SAY = "say what the agent observes, sensor by sensor in the order of their names: --sensors SHAPE,... with shapes like"
 
 
-@dataclass(frozen=True, slots=True)
-class Sensor:
+class Sensor(Struct, frozen=True):
     """One input of the network: its shape (lists of entities [most, numbers], images C, H, W), its module (None:
     the numbers go in as they are), and why it is one.
     """
@@ -34,8 +34,7 @@ class Sensor:
     says: str = "--sensors says so"
 
 
-@dataclass(frozen=True, slots=True)
-class Encoder:
+class Encoder(Struct, frozen=True):
     """A visual encoder: what each side of an image becomes, by (kernel, stride) of convolutions and pools."""
 
     key: str
@@ -79,16 +78,14 @@ def dense_name(state: Weights, module: str) -> str:
 # ------------------------------------------------------------------ in which order
 
 
-@dataclass(frozen=True, slots=True)
-class Module:
+class Module(Struct, frozen=True):
     """A module of a checkpoint that encodes a sensor."""
 
     state: Weights
     name: str
 
 
-@dataclass(frozen=True, slots=True)
-class Layout:
+class Layout(Struct, frozen=True):
     """What the weights tell of all sensors: modules in their order (None: one without weights), the columns that each
     takes of the first layer, and how many are left over; ``two_lists``: vectors stand before the images.
     """

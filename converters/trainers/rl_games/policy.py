@@ -7,8 +7,9 @@ the settings say otherwise) and then scaled to limits that only the environment 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import field
 from typing import Any
+
+from msgspec import Struct, field
 
 from converters.graph.nn.activations import clip
 from converters.graph.nn.convolution import Window
@@ -21,7 +22,6 @@ from converters.trainers.rl_games.normaliser import normalise, observed_shape
 from converters.trainers.settings import Settings
 from converters.trainers.trainer import Saved
 from signatures.errors import SourceError
-from signatures.records import dataclass
 from signatures.roles import Role
 
 EXPORT_ONNX = "load it in rl_games, export the module that gives the action (torch.onnx.export), and give the .onnx"
@@ -31,8 +31,7 @@ _TRAINING = ("value.", "critic_cnn.", "critic_mlp.", "c_rnn.", "c_layer_norm.", 
 _A2C = "a2c_network."
 
 
-@dataclass
-class _Making:
+class _Making(Struct):
     """A policy in the making."""
 
     net: Network

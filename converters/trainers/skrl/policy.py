@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import field
 from functools import partial
 from typing import Any
 
 import numpy as np
+from msgspec import Struct, field
 
 from converters.graph.nn.activations import Activation, clip
 from converters.graph.nn.convolution import Window
@@ -27,7 +27,6 @@ from converters.trainers.settings import MAX_UNITS, Settings
 from converters.trainers.skrl.expressions import evaluate
 from converters.trainers.trainer import Saved
 from signatures.errors import DamagedFileError, SourceError, UsageError
-from signatures.records import dataclass
 from signatures.roles import Role
 
 EXPORT_ONNX = "load it in skrl, export the policy (torch.onnx.export, its preprocessor included), and give the .onnx"
@@ -41,8 +40,7 @@ _CLASSES = ("GaussianMixin", "DeterministicMixin", "CategoricalMixin")
 _EPSILON, _LIMIT = 1e-8, 5.0
 
 
-@dataclass
-class _Making:
+class _Making(Struct):
     net: Network
     model: Settings
     observation: str

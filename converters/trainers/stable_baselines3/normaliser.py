@@ -10,17 +10,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping
-from dataclasses import field
 from typing import Any
 
 import numpy as np
+from msgspec import Struct, field
 
 from converters.files.pickled_objects import Instance, array_of, unpickle_objects
 from converters.graph.nn.activations import clip
 from converters.graph.types import FLOAT32
 from converters.trainers.pytorch.network import Network
 from signatures.errors import DamagedFileError, NotAPolicyError, SourceError
-from signatures.records import dataclass
 from signatures.roles import Role
 
 _CLASS = "VecNormalize"
@@ -33,8 +32,7 @@ _OTHERWISE = f"{_GIVE}; or leave it out: --set normaliser=none"
 _FAR = 16.0
 
 
-@dataclass(frozen=True, slots=True)
-class Moments:
+class Moments(Struct, frozen=True):
     """The mean and deviation of one observation, float64, in its shape; ``frames``: how many are stacked in it."""
 
     mean: np.ndarray
@@ -42,8 +40,7 @@ class Moments:
     frames: int = 1
 
 
-@dataclass
-class Normaliser:
+class Normaliser(Struct):
     """A file's statistics, by the key of the observation (``ALONE`` where there is one observation).
 
     ``limit``: where it is clipped; ``keyed``: whether the observations are a Dict; ``applied``: what the policy's

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import field
 from typing import Any, TypeAlias
 
 import numpy as np
+from msgspec import Struct, field
 
 from converters.graph.nn.activations import Activation, clip
 from converters.graph.nodes import Graph
@@ -25,7 +25,6 @@ from converters.trainers.stable_baselines3.layers import renormalised_mlp
 from converters.trainers.stable_baselines3.normaliser import Normaliser
 from converters.trainers.stable_baselines3.spaces import Space, space_of
 from signatures.errors import DamagedFileError, SourceError, UsageError
-from signatures.records import dataclass
 from signatures.roles import Role
 
 _EXPORT_ONNX = "export the model to ONNX in its own project (torch.onnx.export), and give that"
@@ -40,8 +39,7 @@ _TRAINING = (
 _TAKEN = ("action", "action_masks", "recurrent_in", "recurrent_out", "q_values", "epsilon")
 
 
-@dataclass(frozen=True, slots=True)
-class _Family:
+class _Family(Struct, frozen=True):
     """A class of policies: its trainer, its default activation, how it acts, and whether tanh bounds its action."""
 
     algorithm: str
@@ -50,8 +48,7 @@ class _Family:
     squashed: bool = False
 
 
-@dataclass
-class _Built:
+class _Built(Struct):
     """A policy in the making."""
 
     net: Network

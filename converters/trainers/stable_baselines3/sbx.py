@@ -15,12 +15,12 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
 
 from converters.files.pickled_objects import Instance, array_of, unpickle_objects
 from converters.trainers.pytorch.weights import ArraysByName
 from converters.trainers.stable_baselines3.spaces import Space, space_of
 from signatures.errors import DamagedFileError, SourceError
-from signatures.records import dataclass
 
 _EXPORT_ONNX = "export the policy to ONNX in its own project (jax2onnx), and give that"
 _SAVE_AGAIN = "save the model again: model.save"
@@ -36,8 +36,7 @@ _ACTIVATIONS = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class _Actor:
+class _Actor(Struct, frozen=True):
     """Of a module of SBX: its twin in Stable-Baselines3, where the parameters are, the class that computes with them,
     what the hidden layers are called there, and the last ones; ``hidden``: with an activation behind the last.
     """

@@ -12,9 +12,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
 
 from signatures.errors import DamagedFileError, SourceError
-from signatures.records import dataclass
 
 _NUMBER = re.compile(r"[-+]?(?:inf|nan|\d+\.?\d*(?:e[-+]?\d+)?|\.\d+)", re.IGNORECASE)
 _MEMBER = re.compile(r"""(['"])((?:[^'"\\]|\\.){0,80})\1\s*[:,]\s*(Box|Discrete|MultiDiscrete|MultiBinary)\(""")
@@ -24,8 +24,7 @@ _MAX_TEXT = 1 << 17
 _SAVE_AGAIN = "save the model again: model.save"
 
 
-@dataclass(frozen=True, slots=True)
-class Space:
+class Space(Struct, frozen=True):
     """One space. ``counts``: how many values (Discrete has one number, MultiDiscrete some); ``low`` and ``high``: the
     text of a Box's bounds.
     """

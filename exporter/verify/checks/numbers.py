@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 
 import numpy as np
+from msgspec.structs import replace
 
 from converters.formats.registry import narrows
 from exporter.verify.difference import Difference, add_histograms, wrong

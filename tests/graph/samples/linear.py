@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
+from msgspec.structs import replace
 
 from converters.graph.nodes import Graph, Node
 from converters.graph.ops.table import TABLE

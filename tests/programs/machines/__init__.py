@@ -7,8 +7,9 @@ import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
-from converters.runtimes.javascript.node import node_executable
 from signatures.records import dataclass
+
+from converters.runtimes.javascript.node import node_executable
 
 HERE = Path(__file__).resolve().parent
 WARNINGS = ("-Wall", "-Wextra", "-Wconversion", "-Werror")

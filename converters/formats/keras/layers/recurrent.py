@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
 
 from converters.formats.keras.layers.activations import activation_of
 from converters.formats.keras.layers.step import Step, Translate
@@ -14,14 +15,12 @@ from converters.graph.nn import recurrent as nn
 from converters.graph.nn.activations import Activation
 from converters.graph.types import FLOAT32
 from signatures.errors import DamagedFileError, UnsupportedOpError
-from signatures.records import dataclass
 
 #: (x [B, n], states) → the new states; the first is what the cell gives.
 Turn = Callable[[str, Sequence[str]], list[str]]
 
 
-@dataclass(frozen=True)
-class _Cell:
+class _Cell(Struct, frozen=True):
     """What one step computes, and the width of each state."""
 
     turn: Turn

@@ -6,16 +6,15 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from msgspec import Struct
 
 from signatures.errors import UnsupportedOpError
-from signatures.records import dataclass
 
 if TYPE_CHECKING:
     from converters.formats.litert.importer.importer import Importer
 
 
-@dataclass(frozen=True, slots=True)
-class Op:
+class Op(Struct, frozen=True):
     """One operator. ``inputs`` are references into the new graph, None for an operand that is left out.
 
     ``name`` is its first result's, ``options`` the fields that the file says, ``dtypes`` those of its results.

@@ -6,9 +6,9 @@ The transposes of neighbouring layers cancel (converters/compiler/passes/transpo
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
+from msgspec.structs import replace
 
 from converters.formats.onnx.importer.importer import Importer
 from converters.formats.onnx.importer.node import Op, Translate

@@ -9,12 +9,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from msgspec import Struct
+
 from converters.graph.types import BATCH, Dim, Symbols
-from signatures.records import dataclass
 
 
-@dataclass(frozen=True, slots=True)
-class Axis:
+class Axis(Struct, frozen=True):
     """A free axis: its length at export, and how many elements of it came before the batch's (1: the batch leads)."""
 
     length: int

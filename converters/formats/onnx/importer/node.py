@@ -6,11 +6,11 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from msgspec import Struct
 
 from converters.graph.types import FLOAT32
 from signatures.dtypes import DATA_TYPES
 from signatures.errors import UnsupportedOpError
-from signatures.records import dataclass
 
 if TYPE_CHECKING:
     from converters.formats.onnx.importer.importer import Importer
@@ -29,8 +29,7 @@ DTYPES: Mapping[int, np.dtype] = {
 _UNREAD = {0: "undefined", 8: "string", 12: "uint32", 13: "uint64", 14: "complex64", 15: "complex128"}
 
 
-@dataclass(frozen=True, slots=True)
-class Op:
+class Op(Struct, frozen=True):
     """One ONNX node. ``inputs`` are references into the new graph, None for one that is left out.
 
     ``opset`` is the version of the node's own domain; ``outputs`` are the values' names, empty for one left out.

@@ -8,12 +8,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
+from msgspec import Struct
 
 from converters.formats.onnx.importer.importer import Importer
 from converters.formats.onnx.importer.node import Op, Translate
 from converters.graph.nn import recurrent as nn
 from converters.graph.types import FLOAT32, Dim
-from signatures.records import dataclass
 
 _DEFAULTS = {
     "LSTM": ("sigmoid", "tanh", "tanh"),
@@ -26,8 +26,7 @@ _DEFAULTS = {
 _Run = tuple[Sequence[str], Sequence[str]]
 
 
-@dataclass(frozen=True, slots=True)
-class _Steps:
+class _Steps(Struct, frozen=True):
     """One layer: its inputs [B, n] in the order of time, the rows, and how its results are laid out."""
 
     inputs: Sequence[str]

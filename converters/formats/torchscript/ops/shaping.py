@@ -5,10 +5,10 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from msgspec.structs import replace
 
 from converters.formats.torchscript.machine import Machine, unknown_length
 from converters.formats.torchscript.ops.scalars import dtype_of

@@ -11,11 +11,11 @@ from collections.abc import Callable, Sequence
 from typing import Any, Literal, Protocol
 
 import numpy as np
+from msgspec import Struct
 
 from converters.graph.nodes import Node
 from converters.graph.types import BOOL, FLOAT32, INT32, INT64, TensorType
 from signatures.errors import UnsupportedOpError
-from signatures.records import dataclass
 
 #: Every function that an expression may apply; an emitter has a row for each.
 FUNCTIONS = frozenset(
@@ -33,8 +33,7 @@ Kind = Literal["sum", "product", "max", "min", "first largest", "first smallest"
 DTYPES = (FLOAT32, INT32, INT64, BOOL)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Tensor:
+class Tensor(Struct, frozen=True, eq=False):
     """A tensor of the program, row by row: ``place`` is what holds its elements, which views share."""
 
     place: Any
@@ -42,16 +41,14 @@ class Tensor:
     shape: tuple[int, ...]
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Number:
+class Number(Struct, frozen=True, eq=False):
     """A number as it is."""
 
     value: float
     dtype: np.dtype
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Counter:
+class Counter(Struct, frozen=True, eq=False):
     """What a loop counts."""
 
     name: str
@@ -59,8 +56,7 @@ class Counter:
     dtype: np.dtype = INT32
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Element:
+class Element(Struct, frozen=True, eq=False):
     """An element of a tensor, by an index for each axis."""
 
     tensor: Tensor
@@ -72,8 +68,7 @@ class Element:
         return self.tensor.dtype
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Applied:
+class Applied(Struct, frozen=True, eq=False):
     """A function of ``FUNCTIONS`` of operands."""
 
     function: str
@@ -81,8 +76,7 @@ class Applied:
     dtype: np.dtype
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Reduced:
+class Reduced(Struct, frozen=True, eq=False):
     """What is kept of ``body`` while ``counters`` count."""
 
     kind: Kind
@@ -91,15 +85,13 @@ class Reduced:
     dtype: np.dtype
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Drawn:
+class Drawn(Struct, frozen=True, eq=False):
     """The next number of the caller's stream: uniform, above 0 and below 1."""
 
     dtype: np.dtype = FLOAT32
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Given:
+class Given(Struct, frozen=True, eq=False):
     """A parameter of a function that a program brings along."""
 
     name: str

@@ -10,14 +10,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 import numpy as np
+from msgspec import Struct
 
 from converters.graph.ops.loops.base import Expression, Number, apply, holds, number, select_expression
 from converters.graph.types import FLOAT32, INT32
-from signatures.records import dataclass
 
 
-@dataclass(frozen=True, slots=True)
-class Own:
+class Own(Struct, frozen=True):
     """A function of float32, and how far it is off at most, in units in the last place of the true value."""
 
     function: Callable[..., Expression]
