@@ -82,9 +82,9 @@ def run_steps(graph: Graph, outputs: Outputs, steps: tuple[Step, ...]) -> Graph:
     shared = len(FEWER_OPS)
     if steps[:shared] == FEWER_OPS:
         key = FEWER_OPS, outputs
-        if key not in graph.made:
-            graph.made[key] = _run(graph, outputs, FEWER_OPS)
-        graph, steps = graph.made[key], steps[shared:]
+        if key not in graph.cache:
+            graph.cache[key] = _run(graph, outputs, FEWER_OPS)
+        graph, steps = graph.cache[key], steps[shared:]
     return _run(graph, outputs, steps)
 
 

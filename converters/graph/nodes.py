@@ -20,7 +20,7 @@ from signatures.errors import GraphError
 #: Attribute values: bool, int, float, str, bytes, numpy dtype, ``TensorShape``, ndarray, or a tuple of these.
 AttrValue = Any
 #: The types that a node read, what came of them, and the elements that were folded.
-Inferred = tuple[Sequence[TensorType], Sequence[TensorType], int]
+Inference = tuple[Sequence[TensorType], Sequence[TensorType], int]
 
 
 class TensorShape(Struct, frozen=True):
@@ -46,13 +46,13 @@ class Node(Struct, frozen=True, dict=True):
     origin: str | tuple[str, ...] | None = None
 
     @property
-    def inferred(self) -> Inferred | None:
+    def inference(self) -> Inference | None:
         """What ``shapes`` last inferred of it."""
-        return self.__dict__.get("_inferred")
+        return self.__dict__.get("_inference")
 
-    def keep_inferred(self, inferred: Inferred | None) -> None:
+    def keep_inference(self, inference: Inference | None) -> None:
         """Keep what was inferred, beside the fields: it is not compared, and ``replace`` leaves it out."""
-        self.__dict__["_inferred"] = inferred
+        self.__dict__["_inference"] = inference
 
     @property
     def dims(self) -> tuple[int | None, ...] | None:
@@ -70,7 +70,7 @@ class Node(Struct, frozen=True, dict=True):
         if fed == self.inputs and name == self.name:
             return self
         made = Node(name, self.op, fed, self.attrs, self.value, self.origin)
-        made.keep_inferred(self.inferred)
+        made.keep_inference(self.inference)
         return made
 
 
@@ -142,12 +142,12 @@ class Graph(Struct, frozen=True, dict=True):
         return by_name(self.nodes)
 
     @cached_property
-    def inferred(self) -> dict[bool, dict[str, TensorType]]:
+    def inferences(self) -> dict[bool, dict[str, TensorType]]:
         """What ``shapes.infer_types`` found, by its ``partial``: half of the passes ask for it."""
         return {}
 
     @cached_property
-    def made(self) -> dict[Any, Any]:
+    def cache(self) -> dict[Any, Any]:
         """What was made of it and may be asked for again: by who made it, and of what else."""
         return {}
 

@@ -35,7 +35,7 @@ class _Plan(Struct, frozen=True):
 def _plan(graph: Graph, fed: Collection[str], fetch: Sequence[str]) -> _Plan:
     """The graph's own for these tensors: a policy is run hundreds of times for the same ones."""
     key = _plan, tuple(fed), tuple(fetch)
-    if key not in graph.made:
+    if key not in graph.cache:
         needed = _upstream_nodes(graph, fetch, fed)
         constants, steps = dict[str, np.ndarray](), list[Node]()
         for node in graph.nodes:
@@ -56,8 +56,8 @@ def _plan(graph: Graph, fed: Collection[str], fetch: Sequence[str]) -> _Plan:
         for reference, number in last.items():
             if reference not in kept:
                 done[number].append(reference)
-        graph.made[key] = _Plan(constants, [(op_of(n), n, d) for n, d in zip(steps, done, strict=True)])
-    plan: _Plan = graph.made[key]
+        graph.cache[key] = _Plan(constants, [(op_of(n), n, d) for n, d in zip(steps, done, strict=True)])
+    plan: _Plan = graph.cache[key]
     return plan
 
 

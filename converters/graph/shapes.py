@@ -38,9 +38,9 @@ def infer_types(graph: Graph, *, partial: bool = False) -> Types:
     unrolling. Otherwise they raise UnsupportedOpError, as unknown ops always do. Raises GraphError where shapes
     contradict each other.
     """
-    if partial not in graph.inferred:
-        graph.inferred[partial] = _infer(graph, partial)
-    return dict(graph.inferred[partial])
+    if partial not in graph.inferences:
+        graph.inferences[partial] = _infer(graph, partial)
+    return dict(graph.inferences[partial])
 
 
 def _infer(graph: Graph, partial: bool) -> Types:
@@ -71,8 +71,8 @@ def add_types(types: Types, node: Node, symbols: Symbols, allowance: Allowance) 
     them, which must be the graph's own. What they fold is counted every time.
     """
     args = _arguments(node, types)
-    if node.inferred is not None:
-        before, results, folded = node.inferred
+    if node.inference is not None:
+        before, results, folded = node.inference
         if not ((args == before or _are_same(args, before)) and allowance.take(folded)):
             results = _inferred_anew(node, args, symbols, allowance)
     else:
@@ -89,7 +89,7 @@ def _inferred_anew(
     made = symbols.count
     results = _results(op_of(node), node, args, symbols, allowance)
     if symbols.count == made and allowance.left >= 0:
-        node.keep_inferred((args, results, _folded_elements(node, args, results)))
+        node.keep_inference((args, results, _folded_elements(node, args, results)))
     return results
 
 

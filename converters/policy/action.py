@@ -105,14 +105,14 @@ def _leaves(graph: Graph, reference: str) -> list[str]:
 
 def _clips_until(graph: Graph) -> Mapping[str, int]:
     """How many times classes are clipped one after the other until a node, by its name."""
-    if _clips_until not in graph.made:
+    if _clips_until not in graph.cache:
         found: dict[str, int] = {}
         for node in graph.nodes:
             bound = graph.constant(node.inputs[1]) if node.op == "Minimum" else None
             clips = bound is not None and bound.dtype.kind in "iu"
             found[node.name] = max((found.get(node_of(r), 0) for r in node.inputs), default=0) + clips
-        graph.made[_clips_until] = found
-    known: Mapping[str, int] = graph.made[_clips_until]
+        graph.cache[_clips_until] = found
+    known: Mapping[str, int] = graph.cache[_clips_until]
     return known
 
 

@@ -54,10 +54,10 @@ def runnable(graph: Graph) -> Graph:
 
     Made once for a graph: to reckon what it costs, to look inside, and to run it.
     """
-    if runnable not in graph.made:
+    if runnable not in graph.cache:
         told = [n for n in graph.nodes if n.value is None or n.value.dtype.kind != "S"]
-        graph.made[runnable] = normalise(graph if len(told) == len(graph.nodes) else Graph(tuple(told)))
-    made: Graph = graph.made[runnable]
+        graph.cache[runnable] = normalise(graph if len(told) == len(graph.nodes) else Graph(tuple(told)))
+    made: Graph = graph.cache[runnable]
     return made
 
 

@@ -30,7 +30,7 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
 
 def frozen_graph(policy: Policy, contract: str = "{}", weights: Storage = "float32") -> Pieces:
     """The policy's GraphDef with its contract, made once; without one, as the numpy reference needs it."""
-    made: dict[Any, Pieces] = policy.graph.made
+    made: dict[Any, Pieces] = policy.graph.cache
     key = frozen_graph, contract, weights
     if key not in made:
         graph = with_contract(store_compactly(policy.graph, weights), contract)
