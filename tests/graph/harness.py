@@ -27,6 +27,7 @@ from converters.graph.types import BATCH, TensorType, static_shape
 from converters.policy.policy import Policy
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.registry import available_runtimes
+from signatures.code import CodeOptions
 from signatures.contract import Contract, Origin
 from signatures.errors import UnsupportedOpError
 from signatures.roles import Role
@@ -99,19 +100,21 @@ class Runtimes:
         model.unload()
         return [results[name] for name in names]
 
-    def program(self, key: str, policy: Policy, feeds: Mapping[str, Array]) -> list[Array]:
+    def program(
+        self, key: str, policy: Policy, feeds: Mapping[str, Array], code: CodeOptions | None = None
+    ) -> list[Array]:
         """The outputs of a policy as source code of a format, compiled where that needs it."""
         (runtime,) = WRITTEN[key].runtimes
         self.need(runtime)
         inputs = tuple(replace(s, role=Role.PARAMETER) for s in policy.signature.inputs)
         signature = replace(policy.signature, inputs=inputs)
-        contract = Contract(
-            policy.name, signature, Origin("test", "0" * 64), policy.source, {"name": "export-model", "version": "test"}
-        )
-        artifact = WRITTEN[key].artifact(replace(policy, signature=signature), WriteOptions(contract.compact()))
+        code, tool = code or CodeOptions(), {"name": "export-model", "version": "test"}
+        contract = Contract(policy.name, signature, Origin("test", "0" * 64), policy.source, tool)
+        how = WriteOptions(contract.compact(), code=code)
+        artifact = WRITTEN[key].artifact(replace(policy, signature=signature), how)
         root = self._folder / str(next(self._numbers))
         artifact.write(root)
-        model = self._pool.process(runtime).load(str(root / artifact.main), kind="graph", format=key)
+        model = self._pool.process(runtime).load(str(root / artifact.main), kind="graph", format=key, seed=1)
         names = [s.name for s in policy.signature.outputs]
         results = model.run(dict(feeds), names)
         model.unload()

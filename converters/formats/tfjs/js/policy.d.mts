@@ -96,8 +96,9 @@ export declare class Agent {
   ): Promise<Decision>;
 }
 
-/** `source`: the URL of model.json or a loader with `load()` (TensorFlow.js); the URL or bytes of the .onnx. */
+/** `source`: the URL of model.json or a loader with `load()` (TensorFlow.js); the URL or bytes of the .onnx; for `code`, the
+ *  module of --to js, policy.json or its URL. */
 export declare function loadPolicy(
-  source: string | Uint8Array | ArrayBuffer | { load(): Promise<unknown> },
-  options: { tf?: unknown; ort?: unknown; contract?: string | Contract; seed?: number },
+  source: string | Uint8Array | ArrayBuffer | Contract | { load(): Promise<unknown> },
+  options: { tf?: unknown; ort?: unknown; code?: unknown; contract?: string | Contract; seed?: number },
 ): Promise<Policy>;

@@ -1,5 +1,5 @@
 /**
- * Acts with a policy that export-model exported, in TensorFlow.js or onnxruntime-web.
+ * Acts with a policy that export-model exported, in TensorFlow.js, onnxruntime-web or its own source code.
  *
  *     import * as tf from "@tensorflow/tfjs";
  *     import { loadPolicy } from "./policy.mjs";
@@ -8,6 +8,7 @@
  *     const { continuous } = await policy.decide({ state: [0, 0.1, 0, 4, 0, 0, 0, 0] }, { deterministic: true });
  *
  *     const other = await loadPolicy("3DBall.onnx", { ort, contract: "policy.json" });     // onnxruntime-web
+ *     const alone = await loadPolicy("policy.json", { code: await import("./3DBall.mjs") });      // --to js
  *
  * It imports nothing: the runtime is the page's own. Draws are made here, from log-probabilities and with normal noise,
  * by the generator that `exporter.load_policy` has in Python: one seed, the same actions everywhere. Types are in
@@ -85,15 +86,19 @@ function upperHalf(a, b) {
 // ---- loading --------------------------------------------------------------------------------------------------------
 
 /**
- * @param {string | object} source the URL, or in Node the path, of model.json (a loader with `load()` will do) or of the
- *   .onnx (bytes will do)
- * @param {{tf?: object, ort?: object, contract?: string | object, seed?: number}} options exactly one of tf and ort;
- *   `contract` is policy.json, its URL or in Node its path, needed for ONNX ("policy.json" beside the model where it is
- *   left out)
+ * @param {string | object} source the URL, or in Node the path, of model.json (a loader with `load()` will do), of the
+ *   .onnx (bytes will do), or for code of policy.json
+ * @param {{tf?: object, ort?: object, code?: object, contract?: string | object, seed?: number}} options exactly one of
+ *   tf, ort and code, the module of --to js; `contract` is policy.json, its URL or in Node its path, needed for ONNX
+ *   ("policy.json" beside the model where it is left out)
  */
-export async function loadPolicy(source, { tf, ort, contract, seed = 0 } = {}) {
-  if ((tf === undefined) === (ort === undefined)) {
-    throw new TypeError("loadPolicy needs a runtime: { tf } of TensorFlow.js, or { ort } of onnxruntime-web");
+export async function loadPolicy(source, { tf, ort, code, contract, seed = 0 } = {}) {
+  if ([tf, ort, code].filter((runtime) => runtime !== undefined).length !== 1) {
+    throw new TypeError("loadPolicy needs a runtime: { tf } of TensorFlow.js, { ort } of onnxruntime-web, or { code }");
+  }
+  if (code !== undefined) {
+    const said = contract ?? source;
+    return new Policy(typeof said === "string" ? await readJson(said) : said, withCode(code), () => {}, seed);
   }
   const [run, own, dispose] = tf === undefined ? await withOnnx(ort, source, contract) : await withTfjs(tf, source);
   const found = own ?? (typeof contract === "string" ? await readJson(contract) : contract);
@@ -177,6 +182,39 @@ async function withOnnx(ort, source, contract) {
     return Object.fromEntries(names.map((name) => [name, { data: plain(answers[name].data), shape: answers[name].dims }]));
   };
   return [run, own, () => session.release()];
+}
+
+/**
+ * Runs what --to js wrote, an agent after the other. An output for all agents is the last one's; those that the module
+ * does not have are left out.
+ */
+export function withCode({ default: Code, ports }, agent = new Code()) {
+  const [state, next] = ports.state ?? [];
+  const answered = { ...ports.outputs };
+  if (next !== undefined) answered[next] = Object.values(ports.inputs).find(([member]) => member === state);
+  return async (feeds, names) => {
+    const fed = Object.entries(feeds).map(([name, { data }]) => [...ports.inputs[name], data]);
+    const rows = Math.max(1, ...fed.map(([, , shape, data]) => data.length / size(shape.map((n) => n ?? 1))));
+    const found = {};
+    for (const name of names.filter((name) => answered[name] !== undefined)) {
+      const shape = answered[name][2].map((n) => n ?? rows);
+      found[name] = { data: new agent[answered[name][0]].constructor(size(shape)), shape };
+    }
+    for (let row = 0; row < rows; row++) {
+      for (const [member] of Object.values(ports.inputs)) agent[member].fill(0);
+      for (const [member, , , data] of fed) {
+        const { length } = agent[member];
+        const start = data.length > length ? row * length : 0;
+        agent[member].set(data.subarray(start, start + length));
+      }
+      agent.compute();
+      for (const [name, { data }] of Object.entries(found)) {
+        const values = agent[answered[name][0]];
+        data.set(values, data.length > values.length ? row * values.length : 0);
+      }
+    }
+    return found;
+  };
 }
 
 // ---- deciding -------------------------------------------------------------------------------------------------------
