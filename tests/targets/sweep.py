@@ -135,8 +135,8 @@ def _runtime(name: str) -> str:
 
 
 def swept(files: Sequence[Path], pool: RuntimePool | None = None, names: Collection[str] = ()) -> dict[str, Any]:
-    """Everything that is counted, as JSON; ``names`` are the profiles, all of them where none is given."""
-    wanted = [p for p in PROFILES if not names or p.name in names]
+    """Everything that is counted, as JSON; ``names`` are the profiles, where none is given all of ML-Agents'."""
+    wanted = [p for p in PROFILES if (p.name in names if names else not p.loaders)]
     cells = {(p.name, form): Cell() for p in wanted for form in p.formats}
     unread: Counter[str] = Counter()
     policies = 0
