@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from converters.compiler.passes.normalise import normalise
+from converters.formats.format import WriteOptions
+from converters.formats.registry import WRITTEN
 from converters.graph.nodes import Graph, Node, TensorShape
 from converters.graph.shapes import infer_types
 from converters.graph.types import BOOL, FLOAT32
 from exporter.export.sources import read_source
 from fixtures import path as fixture
-from signatures.errors import GraphError
+from signatures.errors import GraphError, UnsupportedOpError
+from tests.handmade import constant, graph_bytes, node, placeholder
 
 
 def test_a_node_that_reads_something_else_is_inferred_anew() -> None:
@@ -61,3 +66,31 @@ def test_operands_of_several_dtypes_are_refused(op: str) -> None:
     with pytest.raises(GraphError) as refused:
         infer_types(Graph((x, y, Node("z", op, inputs))))
     assert "they are of bool and float32, and must be of one dtype" in (refused.value.why or "")
+
+
+def test_a_target_shape_of_floats_is_refused() -> None:
+    x = Node("x", "Placeholder", (), {"dtype": FLOAT32, "shape": TensorShape((2,))})
+    with pytest.raises(GraphError) as refused:
+        infer_types(Graph((x, Node("z", "Reshape", ("x", "x")))))
+    assert "the target shape is of float32" in (refused.value.why or "")
+
+
+@pytest.mark.parametrize("op", ["Mean", "Sum", "Max", "Squeeze", "SplitV"])
+def test_an_operand_of_a_computed_rank_is_not_written(op: str, tmp_path: Path) -> None:
+    """It had ended in an assertion of the ONNX writer."""
+    nodes = [
+        placeholder("vector_observation"),
+        node("long", "Cast", "vector_observation", DstT=np.int64),
+        constant("one", 1),
+        constant("row", [-1]),
+        constant("sizes", [1, 2]),
+        node("flat", "Reshape", "long", "row"),
+        node("shaped", "Reshape", "vector_observation", "flat"),
+        node("z", op, "shaped", *{"Squeeze": [], "SplitV": ["sizes", "one"]}.get(op, ["one"]),
+             **{"Squeeze": {"squeeze_dims": (1,)}, "SplitV": {"num_split": 2}}.get(op, {"keep_dims": False})),
+        node("action", "Tanh", "z"),
+    ]  # fmt: skip
+    source = tmp_path / "ranks.bytes"
+    source.write_bytes(graph_bytes(nodes))
+    with pytest.raises(UnsupportedOpError, match="an operand of a rank that is computed"):
+        WRITTEN["onnx"].artifact(read_source(source).policies()[0], WriteOptions("{}"))

@@ -105,6 +105,8 @@ def target_dims(kind: TensorType, symbols: Symbols) -> list[Dim] | None:
 
 def _infer_reshape(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:
     target = target_dims(args[1], symbols)
+    if args[1].dtype.kind != "i":
+        raise shape_error(node, args, f"the target shape is of {args[1].dtype}, and must be of int32 or int64")
     if target is None:
         return [TensorType(args[0].dtype, None)]
     if target.count(-1) > 1:
@@ -174,7 +176,8 @@ def _infer_squeeze(node: Node, args: Sequence[TensorType], shape: tuple[Dim, ...
 
 def _lower_squeeze(node: Node, builder: OnnxBuilder) -> Any:
     shape = builder.type_of(node.inputs[0]).shape
-    assert shape is not None
+    if shape is None:
+        raise not_constant(node, "an operand of a rank")
     axes = _squeeze_axes(node, shape)
     kept = [d for i, d in enumerate(shape) if i not in axes]
     return emit_squeeze(builder, builder.value(node.inputs[0]), axes, kept)
@@ -182,7 +185,8 @@ def _lower_squeeze(node: Node, builder: OnnxBuilder) -> Any:
 
 def _litert_squeeze(node: Node, builder: LitertBuilder) -> Value:
     kind = builder.type_of(node.inputs[0])
-    assert kind.shape is not None
+    if kind.shape is None:
+        raise not_constant(node, "an operand of a rank")
     axes = _squeeze_axes(node, kind.shape)
     return without(builder, builder.value(node.inputs[0]), kind.dtype, kind.shape, axes)
 

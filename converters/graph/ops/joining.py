@@ -159,7 +159,8 @@ def _infer_split(node: Node, args: Sequence[TensorType], symbols: Symbols) -> li
 def _lower_split(node: Node, builder: OnnxBuilder) -> Any:
     data_at, axis_at = (1, 0) if node.op == "Split" else (0, 2)
     kind = builder.type_of(node.inputs[data_at])
-    assert kind.shape is not None
+    if kind.shape is None:
+        raise not_constant(node, "an operand of a rank")
     axis = axis_within(int(constant_input(node, builder, axis_at, "an axis")), len(kind.shape))
     sizes = _split_sizes(node, kind.shape[axis], [builder.type_of(r) for r in node.inputs])
     if any(not isinstance(s, int) for s in sizes):

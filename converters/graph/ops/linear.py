@@ -23,6 +23,7 @@ from converters.graph.ops.base import (
     constant_input,
     direct,
     emit_squeeze,
+    not_constant,
     plain,
     require_constant,
     require_one_dtype,
@@ -208,7 +209,8 @@ def _infer_reduction(node: Node, args: Sequence[TensorType], shape: tuple[Dim, .
 def _lower_reduction(onnx_op: str) -> Callable[[Node, OnnxBuilder], Any]:
     def lower(node: Node, builder: OnnxBuilder) -> Any:
         kind = builder.type_of(node.inputs[0])
-        assert kind.shape is not None
+        if kind.shape is None:
+            raise not_constant(node, "an operand of a rank")
         axes = _axes(constant_input(node, builder, 1, "the axes to reduce over"), len(kind.shape))
         value = builder.value(node.inputs[0])
         keep = bool(node.attrs["keep_dims"])
