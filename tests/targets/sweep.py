@@ -67,6 +67,7 @@ def reason(error: ExportModelError) -> str:
     text = re.sub(r"has \d+ branches", "has several branches", text)
     text = re.sub(r"its observation \w+ is", "one of its observations is", text)
     text = re.sub(r"its memory \(.*\)", "its memory", text)
+    text = re.sub(r"it reshapes the memory \w+", "it reshapes its memory", text)
     return re.sub(r"Reshape cannot be written to a .nn: .*\['\?.*", "it has rows for each of several entities", text)
 
 
