@@ -2,8 +2,7 @@
 
 No generated code has to match the installed protobuf, and a real ``tensorflow`` or ``onnx`` in the same process does
 not clash. The descriptor is written as bytes (descriptor.proto has its numbers): neither what protobuf imports to
-describe messages in Python nor the package ``onnx`` is needed to write a file. Where protobuf works in C the classes
-are asked of its library, as ``message_factory`` does: what that module imports is for protobuf in Python, 5 ms of 200.
+describe messages in Python nor the package ``onnx`` is needed to write a file.
 """
 
 from __future__ import annotations
@@ -11,8 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from google.protobuf.internal import api_implementation
-from google.protobuf.message import Message
+from google.protobuf import descriptor_pool, message_factory
 
 from converters.files.wire_format import varint
 
@@ -43,31 +41,9 @@ def message_classes(
     file = _text(1, f"{package}.proto") + _text(2, package) + _text(12, syntax)
     for name, fields in messages.items():
         file += _bytes(4, _message(package, name, fields, oneofs.get(name)))
-    # Private names: where a protobuf has none of them, its public way is taken.
-    library = getattr(api_implementation, "_c_module", None) if api_implementation.Type() == "upb" else None
-    if library is not None and hasattr(library, "MessageMeta") and hasattr(library, "DescriptorPool"):
-        return _classes_in_c(library, file, package, messages)
-    from google.protobuf import descriptor_pool, message_factory
-
     pool = descriptor_pool.DescriptorPool()
     pool.AddSerializedFile(file)
     return {name: message_factory.GetMessageClass(pool.FindMessageTypeByName(f"{package}.{name}")) for name in messages}
-
-
-def _classes_in_c(library: Any, file: bytes, package: str, messages: Mapping[str, str]) -> Mapping[str, Any]:
-    """The class of each message and, by their full names, of the entries of maps, which the library looks for."""
-    pool = library.DescriptorPool()
-    pool.AddSerializedFile(file)
-    classes: dict[str, Any] = {}
-
-    def message_class(descriptor: Any) -> Any:
-        return library.MessageMeta(descriptor.name, (Message,), {"DESCRIPTOR": descriptor, "__module__": None})
-
-    for name in messages:
-        descriptor = pool.FindMessageTypeByName(f"{package}.{name}")
-        classes[name] = message_class(descriptor)
-        classes.update({entry.full_name: message_class(entry) for entry in descriptor.nested_types})
-    return classes
 
 
 def _message(package: str, name: str, fields: str, oneof: str | None) -> bytes:

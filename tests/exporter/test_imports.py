@@ -194,8 +194,7 @@ NOT_LOADED = (
     # the package: messages are written with converters/formats/onnx/messages.py, and its checker is verification's
     *("onnx", "ml_dtypes"),
     # how messages are described in Python: converters/files/protobuf_messages.py describes them in bytes
-    *("google.protobuf.descriptor_pb2", "google.protobuf.json_format", "google.protobuf.descriptor_pool"),
-    *("google.protobuf.message_factory", "google.protobuf.text_format"),
+    *("google.protobuf.descriptor_pb2", "google.protobuf.json_format"),
     *("rich", "email", "http", "ssl", "socket", "asyncio", "multiprocessing", "subprocess", "tarfile"),
     *("numpy.ma", "numpy.random", "numpy.testing", "numpy.fft", "numpy.polynomial", "numpy.f2py", "numpy.ctypeslib"),
     *(
