@@ -7,11 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from msgspec import Struct
 from msgspec.structs import replace
 
 from converters.files.folders import scratch_folder
 from converters.formats.bundle.bundle import Bundle, unfit
 from converters.formats.bundle.embed import runnable
+from converters.formats.format import Format
 from converters.formats.programs.artifact import can_confine
 from converters.formats.registry import FROZEN_GRAPH, WRITTEN
 from converters.formats.saved_model.writer import signatures_of
@@ -42,6 +44,41 @@ if TYPE_CHECKING:
     from converters.consumers.profile import Profile
 
 
+class _Given(Struct, frozen=True):
+    """What a bundle is held against: its source as it was read, and what runs that; or, of a bundle in a consumer's
+    names, the policy made from the source once more.
+    """
+
+    source: Source | None = None
+    original: OriginalRun | None = None
+    again: Job | None = None
+
+
+class _Case(Struct, frozen=True, kw_only=True):
+    """A bundle as it is verified: the formats that are run, with its files, and the source code that is not."""
+
+    bundle: Bundle
+    formats: list[Format]
+    programs: list[str]
+    #: the format that the numpy kernels run beside ``.bytes``, where the bundle has it
+    judge: Format | None
+    made_for: str | None
+    #: nothing is run: the checkers of the consumer are asked alone
+    asked: bool
+
+    @property
+    def artefacts(self) -> dict[str, Path]:
+        """Format → the path that a loader is given."""
+        return {f.key: self.bundle.path(f) for f in self.formats}
+
+    @property
+    def reference(self) -> Path:
+        """The file that the kernels run where the source is not."""
+        if self.judge is None and self.made_for is None:
+            return self.bundle.graph_file
+        return self.bundle.path(self.judge or self.formats[0])
+
+
 def verify_folder(
     folder: Path,
     *,
@@ -63,109 +100,143 @@ def verify_folder(
         raise UsageError(f"--step {step} goes with --source", fix="give the folder of the run: --source FOLDER")
     found = Bundle.open(folder)
     found.verify_hashes()
-    contract = found.contract
-    read = None if source is None else _source_of(source, contract, step, trust_source)
-    signature = contract.signature
-    formats = [f for f in WRITTEN.values() if found.has(f)]
-    artefacts = {f.key: found.path(f) for f in formats}
-    made_for = contract.tool.get("profile")
-    # Names of a consumer are not those of the source: what it was made from is dressed anew, and held against it.
-    dressed = made_for is not None and consumer(made_for).own_names.isdisjoint(artefacts)
-    again = _made_again(read, contract, consumer(made_for)) if read is not None and made_for and dressed else None
-    original = None if read is None or again is not None else _original_of(read, contract)
-    if read is not None and made_for is None:
-        _check_meaning(read, contract, folder)
-    # Without the source, it is the consumer alone that is asked.
-    judge = next((f for f in formats if KERNELS in f.runtimes), None)
-    asked = again is None and made_for is not None and judge is None
-    if asked:
-        _check_asked(found, str(made_for), runtimes, options)
-    reference = found.graph_file if judge is None and made_for is None else found.path(judge or formats[0])
-    for each in formats:
-        if each.held is not None:
-            with naming(artefacts[each.key]):
-                found.verify_contract(each.held(artefacts[each.key]))
-    programs = [] if can_confine() else [f.key for f in formats if f.program]
-    formats = [f for f in formats if f.key not in programs] or formats
-    artefacts = {f.key: artefacts[f.key] for f in formats}
-    names = [s.name for s in (*signature.inputs, *signature.outputs)]
-    if FROZEN_GRAPH.key in artefacts:
-        with naming(reference):
-            embedding = found.graph()
-        graph = _whole_graph(embedding, names, artefacts)
-        with naming(reference):
-            found.check_graph(runnable(graph))
-    else:
-        graph = _outline(signature, noise_kept=contract.source.noise_kept)
-    graph = graph if again is None else again.policy.graph
-    policy = Policy(
-        found.name,
-        graph,
-        signature,
-        {s.name: s.name for s in signature.inputs},
-        {s.name: s.name for s in signature.outputs},
-        contract.source,
-    )
-    used, known = chosen_runtimes(runtimes, formats)
-    sizes = {f.key: found.size(f) for f in formats}
-    with scratch_folder() as scratch, RuntimePool() as pool:
-        copies = _safe_copies(artefacts, names, list(signatures_of(policy)), scratch)
-        tested = policy_under_test(
-            policy,
-            copies,
-            scratch,
-            sizes=sizes,
-            reference=reference if again is None else write_reference(again.policy, scratch),
-            source=original,
-            files=artefacts,
-            profile=made_for,
-            batch=contract.tool.get("batch"),
-            code=CodeOptions.of(contract.tool),
-            runs_elsewhere=read is not None and runs_elsewhere(read),
+    given = _Given() if source is None else _evidence_of(found, _source_of(source, found.contract, step, trust_source))
+    case = _case(found, given)
+    if case.asked:
+        _check_asked(found, str(case.made_for), runtimes, options)
+    for form in (f for f in WRITTEN.values() if found.has(f) and f.held is not None):
+        assert form.held is not None
+        with naming(found.path(form)):
+            found.verify_contract(form.held(found.path(form)))
+    report = _run(case, given, runtimes, options, progress)
+    if case.programs:
+        report = _with_note(
+            report,
+            f"not compiled again: {', '.join(case.programs)}: source code may be any program, and nothing confines "
+            "one here; its bytes were compared",
         )
-        weights = contract.tool.get("weights")
-        # What was rounded is held against itself; the source is asked what it decides.
-        held = replace(tested, source=None) if weights else tested
-        report = verify(held, () if asked else used or ("numpy",), known, pool, options, progress)
-        if weights and original is not None:
-            kept = storage_of(weights)
-            decided = decisions(tested, held, kept, used or ("numpy",), pool, options or VerifyOptions())
-            ran = original.runtime if decided and original.runtime in used else None
-            report = replace(report.with_findings(decided), self_consistent=False, original=ran)
-        if again is not None and again.own is not None:
-            under = own_in(again, formats, scratch / "own")
-            report = join_reports(report, verify(under, used or ("numpy",), known, pool, None, progress))
-    if programs:
-        note = (
-            f"not compiled again: {', '.join(programs)}: source code may be any program, and nothing confines "
-            "one here; its bytes were compared"
+    if case.asked:
+        return _with_note(
+            report,
+            f"made for {case.made_for}: its bytes and what the consumer's checkers say were verified; its numbers were "
+            "compared when it was exported, and are again with --source FILE",
         )
-        report = replace(report, notes=(*report.notes, note))
-    if asked:
-        note = (
-            f"made for {made_for}: its bytes and what the consumer's checkers say were verified; its numbers were "
-            "compared when it was exported, and are again with --source FILE"
-        )
-        return replace(report, notes=(*report.notes, note))
     if source is None:
-        own = (judge or FROZEN_GRAPH).key
-        note = f"the source was not given: the reference is the bundle's own .{own}"
-        report = replace(report, reference=f"{own}/{KERNELS}", notes=(*report.notes, note), self_consistent=False)
-    (first, *others) = formats
-    if report.passed is None and first.elsewhere and not others:
+        own = (case.judge or FROZEN_GRAPH).key
+        report = replace(report, reference=f"{own}/{KERNELS}", self_consistent=False)
+        report = _with_note(report, f"the source was not given: the reference is the bundle's own .{own}")
+    return _unless_unverified(report, case, required=not (allow_unverified or runtimes == "none"))
+
+
+def _with_note(report: ParityReport, note: str) -> ParityReport:
+    return replace(report, notes=(*report.notes, note))
+
+
+def _unless_unverified(report: ParityReport, case: _Case, *, required: bool) -> ParityReport:
+    """Return the report; raise RuntimeUnavailableError where no independent runtime ran and one is ``required``."""
+    (first, *others) = case.formats
+    if report.passed is not None:
+        return report
+    if first.elsewhere and not others:
         # No runtime that is here has it, so none can be asked for: the files are whole and one contract says so.
-        note = (
+        return _with_note(
+            report,
             f"only {first.elsewhere} runs a .{first.key}: its bytes, its contract and that it answers by our own "
-            "reader were verified"
+            "reader were verified",
         )
-        report = replace(report, notes=(*report.notes, note))
-    elif report.passed is None and not report.undecided and not (allow_unverified or runtimes == "none"):
+    if required and not report.undecided:
         raise RuntimeUnavailableError(
             "no independent runtime is installed, so nothing was verified",
-            where=str(folder),
+            where=str(case.bundle.folder),
             why="only the numpy reference ran",
             fix="pip install export-model[onnxruntime] (or [tensorflow]), or --allow-unverified",
         )
+    return report
+
+
+def _evidence_of(found: Bundle, read: Source) -> _Given:
+    """What the source says of a bundle. Raises BundleError where it is another, or means something else."""
+    contract, made_for = found.contract, found.contract.tool.get("profile")
+    if made_for is None:
+        original = _original_of(read, contract)
+        _check_meaning(read, contract, found.folder)
+        return _Given(read, original)
+    wanted = consumer(made_for)
+    if wanted.own_names.isdisjoint(f.key for f in WRITTEN.values() if found.has(f)):
+        # Names of a consumer are not those of the source: what it was made from is dressed anew, and held against it.
+        return _Given(read, again=_made_again(read, contract, wanted))
+    return _Given(read, _original_of(read, contract))
+
+
+def _case(found: Bundle, given: _Given) -> _Case:
+    formats = [f for f in WRITTEN.values() if found.has(f)]
+    judge = next((f for f in formats if KERNELS in f.runtimes), None)
+    made_for = found.contract.tool.get("profile")
+    programs = [] if can_confine() else [f.key for f in formats if f.program]
+    return _Case(
+        bundle=found,
+        formats=[f for f in formats if f.key not in programs] or formats,
+        programs=programs,
+        judge=judge,
+        made_for=made_for,
+        # Without the source, it is the consumer alone that is asked.
+        asked=given.again is None and made_for is not None and judge is None,
+    )
+
+
+def _policy_of(case: _Case, given: _Given) -> Policy:
+    """The policy as its bundle has it: its contract, with the graph of one of its files. Raises BundleError."""
+    found = case.bundle
+    signature, source = found.contract.signature, found.contract.source
+    if FROZEN_GRAPH.key in case.artefacts:
+        with naming(case.reference):
+            embedding = found.graph()
+        graph = _whole_graph(embedding, _names(signature), case.artefacts)
+        with naming(case.reference):
+            found.check_graph(runnable(graph))
+    else:
+        graph = _outline(signature, noise_kept=source.noise_kept)
+    graph = graph if given.again is None else given.again.policy.graph
+    inputs, outputs = ({s.name: s.name for s in specs} for specs in (signature.inputs, signature.outputs))
+    return Policy(found.name, graph, signature, inputs, outputs, source)
+
+
+def _names(signature: PolicySignature) -> list[str]:
+    return [s.name for s in (*signature.inputs, *signature.outputs)]
+
+
+def _run(
+    case: _Case, given: _Given, runtimes: str | Sequence[str], options: VerifyOptions | None, progress: Progress
+) -> ParityReport:
+    """Verify the files, and the policy that a consumer's was made from beside them."""
+    policy, found, again = _policy_of(case, given), case.bundle, given.again
+    used, known = chosen_runtimes(runtimes, case.formats)
+    running = used or (KERNELS,)
+    with scratch_folder() as scratch, RuntimePool() as pool:
+        tested = policy_under_test(
+            policy,
+            _safe_copies(case.artefacts, _names(policy.signature), list(signatures_of(policy)), scratch),
+            scratch,
+            sizes={f.key: found.size(f) for f in case.formats},
+            reference=case.reference if again is None else write_reference(again.policy, scratch),
+            source=given.original,
+            files=case.artefacts,
+            profile=case.made_for,
+            batch=found.contract.tool.get("batch"),
+            code=CodeOptions.of(found.contract.tool),
+            runs_elsewhere=given.source is not None and runs_elsewhere(given.source),
+        )
+        weights = found.contract.tool.get("weights")
+        # What was rounded is held against itself; the source is asked what it decides.
+        held = replace(tested, source=None) if weights else tested
+        report = verify(held, () if case.asked else running, known, pool, options, progress)
+        if weights and given.original is not None:
+            decided = decisions(tested, held, storage_of(weights), running, pool, options or VerifyOptions())
+            ran = given.original.runtime if decided and given.original.runtime in used else None
+            report = replace(report.with_findings(decided), self_consistent=False, original=ran)
+        if again is not None and again.own is not None:
+            under = own_in(again, case.formats, scratch / "own")
+            report = join_reports(report, verify(under, running, known, pool, None, progress))
     return report
 
 

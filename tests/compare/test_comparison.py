@@ -18,7 +18,8 @@ from converters.formats.format import Ports
 from converters.formats.frozen_graph.tensors import from_array, to_array
 from converters.formats.registry import WRITTEN
 from converters.runtimes.pool import RuntimePool
-from exporter.compare.comparison import _labels, compare_artefacts
+from exporter.compare.comparison import compare_artefacts
+from exporter.compare.matching import labels_of
 from exporter.export.pipeline import ExportOptions, export
 from exporter.verify.findings import Finding
 from exporter.verify.report import ParityReport
@@ -140,7 +141,7 @@ def test_labels_tell_candidates_apart_whatever_they_are_called(tmp_path: Path) -
         (tmp_path / "x", WRITTEN["onnx"], Ports(tmp_path / run / "out" / "policy.onnx", (), ()))
         for run in ("a", "b", "a")
     ]
-    assert _labels(found) == ["onnx a/out/policy.onnx", "onnx b/out/policy.onnx", "onnx a/out/policy.onnx (2)"]
+    assert labels_of(found) == ["onnx a/out/policy.onnx", "onnx b/out/policy.onnx", "onnx a/out/policy.onnx (2)"]
 
 
 def test_a_candidate_with_weights_beside_it_that_differs_is_a_failure_that_names_the_tensor(

@@ -6,7 +6,16 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from exporter.verify.checks.draws import DEPENDENT, DRAWS, REPEATED, REPEATED_CALLS, STARTS, likely, repeated_draws
+from exporter.verify.checks.draws import (
+    DEPENDENT,
+    DRAWS,
+    REPEATED,
+    REPEATED_CALLS,
+    STARTS,
+    Arrays,
+    likely,
+    repeated_draws,
+)
 from exporter.verify.difference import Difference, wrong
 from exporter.verify.findings import Draws, Finding
 from exporter.verify.participants import Participant
@@ -26,51 +35,64 @@ def densities(trial: Trial, participant: Participant) -> Iterator[Finding]:
     """Both are drawn many times for one input, the reference by the numpy kernels, and each number of an output is
     tested by itself (Kolmogorov-Smirnov for two samples of one size).
     """
-    names = [
-        n
-        for n in participant.outputs
-        if (trial.is_drawn(n, participant) or n in trial.reference.partly_drawn)
-        and trial.signature.output(n).dtype == "float32"
-    ]
-    if not names:
-        return
-    case = trial.cases[0]
-    runs = (trial.reference.run, participant.run)
+    names = _drawn_numbers(trial, participant)
     vectors = all(len(s.shape) <= 2 for s in trial.signature.observations)
     count = DENSITY_DRAWS if vectors else DRAWS
-    if not trial.allowance(participant, "draws").takes(count, f"{count} draws of numbers"):
+    if not names or not trial.allowance(participant, "draws").takes(count, f"{count} draws of numbers"):
         return
+    case = trial.cases[0]
     feeds = _rows(trial, case, count)
-    samples = [run([feeds], names)[0] for run in runs]
-    apart = {n: said for n in names if (said := _shared_otherwise(*(_columns(s[n]) for s in samples)))}
-    shared = [n for n in names if n not in apart and any((s[n] == s[n][:1]).all() for s in samples)]
-    if shared:
-        # One draw for the whole batch, or none: as many runs as draws.
-        each = [run([_rows(trial, case, 1, i) for i in range(DRAWS)], shared) for run in runs]
-        for sample, every in zip(samples, each, strict=True):
-            sample.update({n: np.concatenate([one[n] for one in every]) for n in shared})
-    # Where all rows are the same nothing was drawn, or once for all of them: the distribution says so.
-    alike = {
-        n
-        for n in repeated_draws(trial, participant, lambda run: run([feeds], names)[0])
-        if (samples[1][n] != samples[1][n][:1]).any()
-    }
-    again = _rows(trial, case, STARTS) if participant.runtime != "numpy" else None
-    calls = [] if again is None else participant.run([again, again], names)
-    called_alike = {n for n in names if calls and np.array_equal(calls[0][n], calls[1][n]) and _varies(samples[0][n])}
+    samples = [run([feeds], names)[0] for run in (trial.reference.run, participant.run)]
+    said = {n: text for n in names if (text := _shared_otherwise(*(_columns(s[n]) for s in samples)))}
+    _draw_shared_anew(trial, participant, [n for n in names if n not in said], samples)
+    said = {**_repetitions(trial, participant, feeds, names, samples), **said}
     for name in names:
-        said = apart.get(name) or (REPEATED if name in alike else REPEATED_CALLS if name in called_alike else None)
-        if said is not None:
-            yield trial.finding(Draws, participant, name, wrong(said), case.name)
-            continue
-        one, other = (_columns(s[name]) for s in samples)
-        if one.shape == other.shape and (difference := _joint(one, other)) is not None:
-            yield trial.finding(Draws, participant, name, difference, case.name)
-            continue
-        tolerance = trial.tolerance(name, participant)
-        pairs = zip(one.T, other.T, strict=True)
-        p_values = [same_distribution(a, b, tolerance.atol, tolerance.rtol) for a, b in pairs]
-        yield trial.finding(Draws, participant, name, likely(min(p_values, default=1.0)), case.name)
+        difference = wrong(said[name]) if name in said else _difference(trial, participant, name, samples)
+        yield trial.finding(Draws, participant, name, difference, case.name)
+
+
+def _drawn_numbers(trial: Trial, participant: Participant) -> list[str]:
+    """The participant's outputs of which all or some numbers are drawn."""
+    drawn = [n for n in participant.outputs if trial.is_drawn(n, participant) or n in trial.reference.partly_drawn]
+    return [n for n in drawn if trial.signature.output(n).dtype == "float32"]
+
+
+def _draw_shared_anew(trial: Trial, participant: Participant, names: list[str], samples: list[Arrays]) -> None:
+    """Replace samples of which all rows share one draw, or that none was drawn for: by as many runs as draws."""
+    shared = [n for n in names if any((s[n] == s[n][:1]).all() for s in samples)]
+    if not shared:
+        return
+    rows = [_rows(trial, trial.cases[0], 1, i) for i in range(DRAWS)]
+    each = [run(rows, shared) for run in (trial.reference.run, participant.run)]
+    for sample, every in zip(samples, each, strict=True):
+        sample.update({n: np.concatenate([one[n] for one in every]) for n in shared})
+
+
+def _repetitions(
+    trial: Trial, participant: Participant, feeds: Arrays, names: list[str], samples: list[Arrays]
+) -> dict[str, str]:
+    """Output → what is wrong with draws that come again: after every start, or in every call."""
+    reference, own = samples
+    starts = repeated_draws(trial, participant, lambda run: run([feeds], names)[0])
+    # Where all rows are the same nothing was drawn, or once for all of them: the distribution says so.
+    said = {n: REPEATED for n in starts if (own[n] != own[n][:1]).any()}
+    if participant.runtime == "numpy":
+        return said
+    again = _rows(trial, trial.cases[0], STARTS)
+    one, other = participant.run([again, again], names)
+    alike = [n for n in names if np.array_equal(one[n], other[n]) and _varies(reference[n])]
+    return {**dict.fromkeys(alike, REPEATED_CALLS), **said}
+
+
+def _difference(trial: Trial, participant: Participant, name: str, samples: list[Arrays]) -> Difference:
+    """How far the distribution of an output is from the reference's, its numbers together and each by itself."""
+    one, other = (_columns(s[name]) for s in samples)
+    if one.shape == other.shape and (difference := _joint(one, other)) is not None:
+        return difference
+    tolerance = trial.tolerance(name, participant)
+    pairs = zip(one.T, other.T, strict=True)
+    p_values = [same_distribution(a, b, tolerance.atol, tolerance.rtol) for a, b in pairs]
+    return likely(min(p_values, default=1.0))
 
 
 def _columns(drawn: np.ndarray) -> np.ndarray:

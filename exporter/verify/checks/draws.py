@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from itertools import combinations
 
 import numpy as np
+from msgspec import Struct
 
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.registry import RUNTIMES
@@ -44,51 +45,84 @@ _ZEROS = {"tfjs-webgl": 2.0**-12}
 _LATTICES = frozenset(("tfjs-webgl",))
 
 
+class _Asked(Struct, frozen=True):
+    """What is drawn for: the classes' output and that of their log-probabilities; inputs, a row each, with these."""
+
+    action: str
+    scores: str
+    cases: list[Case]
+    rows: Sequence[Feeds]
+    log_probs: np.ndarray
+
+
 def draws(trial: Trial, participant: Participant) -> Iterator[Finding]:
     """How well classes fit, one input at a time and all together, branch by branch and two branches at once."""
+    asked = _questions(trial, participant)
+    if asked is None:
+        return
+    action, cases = asked.action, asked.cases
+    branches = trial.signature.branches
+    for branch, row in _started_alike(trial, participant, action, asked.rows, asked.log_probs).items():
+        which = f" (branch {branch} of {len(branches)})" if len(branches) > 1 else ""
+        yield trial.finding(Draws, participant, action, wrong(REPEATED + which), cases[row].name)
+        return
+    if (anew := _called_alike(trial, participant, action, asked.rows, asked.log_probs)) is not None:
+        yield trial.finding(Draws, participant, action, wrong(REPEATED_CALLS), cases[anew].name)
+        return
+    difference, branch, worst = _fit(trial, participant, asked)
+    if difference.passed and (masked := _with_one_forbidden(trial, participant, action, asked.scores)) is not None:
+        yield masked
+        return
+    begins = trial.bisect(participant, action, difference, asked.rows[worst], branch)
+    yield trial.finding(Draws, participant, action, difference, cases[worst].name, bisection=begins)
+
+
+def _questions(trial: Trial, participant: Participant) -> _Asked | None:
+    """The inputs that classes are drawn for; None where the participant draws none, or no odds are known."""
     sampled = [s for s in trial.signature.outputs if s.role is Role.SAMPLED]
     scores = next((s.name for s in trial.signature.outputs if s.role is Role.LOG_PROBS), None)
     if not sampled or scores is None or sampled[0].name not in participant.outputs:
-        return
+        return None
     action = sampled[0].name
     if action not in trial.reference.drawn or any(scores not in e for e in trial.expected):
-        return
+        return None
+    known = _without_open_choices(trial, scores, _known_odds(trial, scores))
+    if not known:
+        return None
+    cases = [case for case, _, _ in known]
+    rows = [{name: array[row : row + 1] for name, array in case.feeds.items()} for case, row, _ in known]
+    log_probs = np.stack([odds for _, _, odds in known])
+    return _Asked(action, scores, cases, rows, _seen_by(participant, log_probs, trial))
+
+
+def _known_odds(trial: Trial, scores: str) -> list[tuple[Case, int, np.ndarray]]:
+    """(case, row, log-probabilities) of the inputs at which these are numbers that every runtime has alike."""
     made = zip(trial.cases[: len(trial.cases) - len(trial.golden.cases)], trial.expected, strict=False)
-    known = [
+    return [
         (case, row, expected[scores][row])
         for case, expected in made
         for row in range(2 if case.name == ONE_ALLOWED else 1)
         if case.name not in _LEFT_OUT and case.name != ONE_FORBIDDEN and not np.isnan(expected[scores][row]).any()
     ]
-    known = _without_open_choices(trial, scores, known)
-    if not known:
-        return
-    cases = [case for case, _, _ in known]
-    rows = [{name: array[row : row + 1] for name, array in case.feeds.items()} for case, row, _ in known]
-    log_probs = np.stack([scores for _, _, scores in known])
-    if participant.runtime in _ZEROS:
-        log_probs = with_zeros(log_probs, trial.signature.branches, _ZEROS[participant.runtime])
-    for branch, row in _started_alike(trial, participant, action, rows, log_probs).items():
-        which = f" (branch {branch} of {len(trial.signature.branches)})" if len(trial.signature.branches) > 1 else ""
-        yield trial.finding(Draws, participant, action, wrong(REPEATED + which), cases[row].name)
-        return
-    if (anew := _called_alike(trial, participant, action, rows, log_probs)) is not None:
-        yield trial.finding(Draws, participant, action, wrong(REPEATED_CALLS), cases[anew].name)
-        return
-    drawn = _draws_of_rows(trial, participant, action, rows)
-    p_value, branch, worst = least_likely(drawn, log_probs, trial.signature.branches)
+
+
+def _seen_by(participant: Participant, log_probs: np.ndarray, trial: Trial) -> np.ndarray:
+    """The log-probabilities with which a runtime draws: of one whose uniform number may be 0, others."""
+    if participant.runtime not in _ZEROS:
+        return log_probs
+    return with_zeros(log_probs, trial.signature.branches, _ZEROS[participant.runtime])
+
+
+def _fit(trial: Trial, participant: Participant, asked: _Asked) -> tuple[Difference, int, int]:
+    """(how the draws fit, the branch and the input that fit worst)."""
+    branches = trial.signature.branches
+    drawn = _draws_of_rows(trial, participant, asked.action, asked.rows)
+    p_value, branch, worst = least_likely(drawn, asked.log_probs, branches)
     difference = likely(p_value)
-    if (
-        difference.passed
-        and participant.runtime not in _LATTICES
-        and (apart := repeats(drawn, log_probs, trial.signature.branches))
-    ):
+    lattice = participant.runtime in _LATTICES
+    if difference.passed and not lattice and (apart := repeats(drawn, asked.log_probs, branches)):
         difference = wrong(DEPENDENT.format(apart))
-    if difference.passed and (masked := _with_one_forbidden(trial, participant, action, scores)) is not None:
-        yield masked
-        return
-    begins = trial.bisect(participant, action, difference, rows[worst], branch)
-    yield trial.finding(Draws, participant, action, difference, cases[worst].name, bisection=begins)
+    return difference, branch, worst
 
 
 def _without_open_choices(
@@ -135,8 +169,7 @@ def _with_one_forbidden(trial: Trial, participant: Participant, action: str, sco
     if not decided.size:
         return None
     drawn, log_probs = drawn[decided], log_probs[decided]
-    if participant.runtime in _ZEROS:
-        log_probs = with_zeros(log_probs, trial.signature.branches, _ZEROS[participant.runtime])
+    log_probs = _seen_by(participant, log_probs, trial)
     p_value, branch, worst = least_likely(drawn, log_probs, trial.signature.branches)
     difference = likely(p_value)
     if difference.passed:

@@ -1,0 +1,235 @@
+"""Which input and output of a candidate, made by any tool, is which of the reference's."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
+
+from converters.compiler.passes.weights import Storage
+from converters.formats.bundle.bundle import Bundle
+from converters.formats.format import Format, Port, Ports
+from converters.formats.read import ports_of
+from converters.policy.policy import Policy
+from exporter.compare.fit import misfit
+from exporter.compare.weights import rounded_to
+from exporter.verify.participants import (
+    Feeds,
+)
+from signatures.contract import POLICY
+from signatures.errors import ExportModelError, UsageError, suggestion
+from signatures.roles import Role
+from signatures.spec import TensorSpec
+
+
+class Problem(Struct, frozen=True):
+    """What does not fit, at which of the reference's names; ``blocking`` where a run would make no sense."""
+
+    name: str
+    text: str
+    blocking: bool = False
+
+
+class Candidate(Struct, frozen=True):
+    """A candidate's ports with the reference's names: what it is fed and asked for under its own."""
+
+    label: str
+    format: Format
+    ports: Ports
+    #: canonical input → the candidate's port
+    inputs: Mapping[str, Port]
+    #: canonical output → the candidate's name of it
+    outputs: Mapping[str, str]
+    #: the candidate's own inputs that have one value only, or the number of rows (None)
+    constant: Mapping[str, np.ndarray | None]
+    #: outputs that the candidate draws, because it makes the noise that the reference is fed
+    drawn: frozenset[str]
+    problems: tuple[Problem, ...]
+    #: outputs that export-model made for the reference, and that this one has none of
+    missing_ok: tuple[str, ...] = ()
+    #: what its weights were rounded to, where they were
+    weights: Storage | None = None
+
+    def own_feeds(self, feeds: Feeds) -> dict[str, np.ndarray]:
+        """What it is fed, by its own names, for the reference's inputs."""
+        rows = next((len(a) for a in feeds.values() if a.ndim), 1)
+        own = [(p, feeds[name]) for name, p in self.inputs.items()]
+        given = {p.name: array.astype(p.dtype or array.dtype, copy=False) for p, array in own}
+        ranks = {p.name: len(p.shape or ()) for p in self.ports.inputs}
+        for name, value in self.constant.items():
+            given[name] = np.full([1] * ranks[name], rows, np.int32) if value is None else np.asarray(value)
+        return given
+
+    @property
+    def format_and_signature(self) -> str:
+        """Its format, and which signature is called where that has some."""
+        return ":".join((self.format.key, *filter(None, [self.ports.options.get("signature")])))
+
+    @property
+    def missing(self) -> list[str]:
+        """Outputs of the reference that it has no name for."""
+        return [p.name for p in self.problems if not p.blocking]
+
+
+def match_candidates(
+    policy: Policy, reference: Path, near: Sequence[Path], names: Mapping[str, str]
+) -> list[Candidate]:
+    """The artefacts at the paths with the reference's names. Raises UsageError where there is none."""
+    artefacts = [(path, *found) for path in near for found in ports_of(path)]
+    if not artefacts:
+        raise UsageError("no candidate was given", fix="export-model compare REFERENCE CANDIDATE...")
+    aliases = _with_user_names(_aliases(policy, reference), names, [p for *_, p in artefacts])
+    made = _made_here(reference, policy)
+    return [
+        replace(_match(label, kind, ports, policy, aliases, made), weights=rounded_to(path))
+        for label, (path, kind, ports) in zip(labels_of(artefacts), artefacts, strict=True)
+    ]
+
+
+def labels_of(found: Sequence[tuple[Path, Format, Ports]]) -> list[str]:
+    """What each candidate is called in the report: its format where that is enough, else with its path."""
+    formats = [kind.key for _, kind, _ in found]
+    if len(set(formats)) == len(formats) and len({path for path, *_ in found}) == 1:
+        return formats
+    paths = [ports.path.resolve() for *_, ports in found]
+    for depth in range(2, max(len(p.parts) for p in paths) + 1):  # as much of the paths as tells them apart
+        labels = [f"{key} {'/'.join(path.parts[-depth:])}" for key, path in zip(formats, paths, strict=True)]
+        if len(set(labels)) == len(set(zip(formats, paths, strict=True))):
+            break
+    turns = [labels[:i].count(label) for i, label in enumerate(labels)]  # one file may be given twice
+    return [f"{label} ({n + 1})" if n else label for label, n in zip(labels, turns, strict=True)]
+
+
+# ---- names
+
+
+def _base(name: str) -> str:
+    """A name without the output index that TensorFlow and tf2onnx append, and what TF Serving prefixes."""
+    return name.removesuffix(":0").removeprefix("serving_default_")
+
+
+def _aliases(policy: Policy, path: Path) -> dict[str, tuple[str, ...]]:
+    """Canonical name → what a candidate may call it: first what the reference's own file does, then the canonical."""
+    keys: dict[str, str] = {}
+    try:
+        own = [ports for _, ports in ports_of(path)]
+    except ExportModelError:  # a checkpoint, a .nn: what nobody feeds by name has no names beside the policy's
+        own = []
+    for port in (p for i in own for p in (*i.inputs, *i.outputs) if p.tensor is not None):
+        keys.setdefault(_base(str(port.tensor)), _base(port.name))
+    aliases: dict[str, tuple[str, ...]] = {}
+    for spec in (*policy.signature.inputs, *policy.signature.outputs):
+        source = _base(spec.source) if isinstance(spec.source, str) else spec.name
+        aliases[spec.name] = tuple(dict.fromkeys([keys.get(source, source), source, spec.name]))
+    return aliases
+
+
+def _with_user_names(
+    aliases: Mapping[str, tuple[str, ...]], names: Mapping[str, str], artefacts: Sequence[Ports]
+) -> dict[str, tuple[str, ...]]:
+    """The aliases, with what --map says before all others of a name. Raises UsageError."""
+    ports = [p for i in artefacts for p in (*i.inputs, *i.outputs)]
+    mapped = dict(aliases)
+    for name, other in names.items():
+        canonical = next((c for c, known in aliases.items() if _base(name) in known), None)
+        if canonical is None:
+            raise UsageError(
+                f"--map {name}={other}: the reference has no input or output {name!r}",
+                fix=_suggestion(name, [a for known in aliases.values() for a in known]),
+            )
+        if _find(other, ports) is None:
+            raise UsageError(
+                f"--map {name}={other}: no candidate has an input or output {other!r}",
+                fix=_suggestion(other, [p.name for p in ports]),
+            )
+        # A candidate that calls it as the reference does needs no map: with several, each is found by its own name.
+        mapped[canonical] = (other, *aliases[canonical])
+    return mapped
+
+
+def _suggestion(name: str, names: Sequence[str]) -> str:
+    names = list(dict.fromkeys(names))
+    return suggestion(name, names).strip() or f"there are {', '.join(names[:20])}"
+
+
+def _find(name: str, ports: Sequence[Port]) -> Port | None:
+    return next((p for p in ports if p.name == name), None) or next((p for p in ports if _base(p.name) == name), None)
+
+
+def _made_here(path: Path, policy: Policy) -> frozenset[str]:
+    """Outputs of the reference that its source had not, as a bundle's policy.json says (or the graph that was read)."""
+    made = {s.name for s in policy.signature.outputs if s.source is None}
+    if (path / POLICY).is_file():
+        made |= {s.name for s in Bundle.open(path).signature.outputs if s.source is None}
+    return frozenset(made)
+
+
+def _match(
+    label: str,
+    kind: Format,
+    own: Ports,
+    policy: Policy,
+    aliases: Mapping[str, Sequence[str]],
+    made: frozenset[str],
+) -> Candidate:
+    problems: list[Problem] = []
+
+    def port_of(spec: TensorSpec, ports: Sequence[Port]) -> Port | None:
+        return next((p for a in aliases[spec.name] if (p := _find(a, ports)) is not None), None)
+
+    signature = policy.signature
+    inputs = {s.name: p for s in signature.inputs if (p := port_of(s, own.inputs)) is not None}
+    found = {s.name: p for s in signature.outputs if (p := port_of(s, own.outputs)) is not None}
+    lacking = [s for s in signature.inputs if s.name not in inputs]
+    noise = frozenset(s.name for s in lacking if s.role is Role.NOISE)
+    drawn = frozenset(policy.graph.descendants(noise).intersection(found))
+    # What was made for the reference may be missing where all of it is: then the candidate is of another maker.
+    missing_ok = tuple(sorted(made - set(found))) if found and not made & set(found) else ()
+    for spec in signature.outputs:
+        if spec.name not in found and spec.name not in missing_ok:
+            text = f"missing output {aliases[spec.name][0]!r}; there are {_names(own.outputs)}"
+            problems.append(Problem(spec.name, text))
+    needed = policy.graph.ancestors(found)
+    for spec in lacking:
+        if spec.role is not Role.NOISE and spec.name in needed:
+            text = f"missing input {aliases[spec.name][0]!r}; there are {_names(own.inputs)}"
+            problems.append(Problem(spec.name, text, blocking=True))
+    for spec in signature.inputs:
+        wrong = misfit(spec, inputs[spec.name]) if spec.name in inputs else ""
+        if wrong:
+            problems.append(Problem(spec.name, wrong, blocking=True))
+    constant, left = _constants(own, policy, {p.name for p in inputs.values()})
+    if not own.open:
+        for port in left:
+            text = f"it takes an input {port.name!r} that is not in the reference"
+            problems.append(Problem(port.name, text, blocking=True))
+    outputs = {n: p.name for n, p in found.items()}
+    return Candidate(label, kind, own, inputs, outputs, constant, drawn, tuple(problems), missing_ok)
+
+
+def _names(ports: Sequence[Port]) -> str:
+    return ", ".join(repr(p.name) for p in ports[:12]) or "none"
+
+
+def _constants(own: Ports, policy: Policy, taken: set[str]) -> tuple[dict[str, np.ndarray | None], list[Port]]:
+    """(the candidate's inputs that are not policy inputs but known: batch_size, sequence_length; those unknown)."""
+    fixed = {_base(n): np.asarray(v) for n, v in policy.source.fixed.items()}
+    batches = {_base(n) for n in policy.source.batch_sizes}
+    constant: dict[str, np.ndarray | None] = {}
+    left = []
+    for port in own.inputs:
+        base = _base(port.name)
+        if port.name in taken:
+            continue
+        if base in fixed:
+            constant[port.name] = fixed[base]
+        elif base in batches or base == "batch_size":
+            constant[port.name] = None
+        elif base == "sequence_length":
+            constant[port.name] = np.array(1, np.int32)
+        else:
+            left.append(port)
+    return constant, left
