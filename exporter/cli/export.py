@@ -123,40 +123,73 @@ def export_command(
 
     This is the default command: 'export-model SOURCE' runs it.
     """
-    from converters.files.fetch import address_of
     from exporter.export.options import ExportOptions, storage
-    from exporter.export.pipeline import export
-    from exporter.fleet.sources import is_many
 
     if profile == "help":
         console.profiles()
         return
     console.prepare(verifies=runtimes != "none")
     job = ExportOptions(
-        out,
-        None if targets is None else [t for t in targets.split(",") if t],
-        name,
-        compiling,
-        read_options(step, sensors, trust_source, activation, normaliser),
-        opset,
-        runtimes,
-        options,
-        labels,
-        profile,
-        storage(dtype, quantize),
-        batch,
-        code,
+        out=out,
+        targets=None if targets is None else [t for t in targets.split(",") if t],
+        name=name,
+        compile=compiling,
+        read=read_options(step, sensors, trust_source, activation, normaliser),
+        opset=opset,
+        verify=runtimes,
+        parity=options,
+        labels=labels,
+        profile=profile,
+        weights=storage(dtype, quantize),
+        batch=batch,
+        code=code,
     )
-    many = (
-        again or fail_fast or is_many(sources) or address_of(out) is not None or jobs is not None or cluster is not None
-    )
+    many = again or fail_fast or jobs is not None or cluster is not None or _are_many(sources, out)
     if env is not None:
         _check_playable(env, 2 if many else len(sources), runtimes, profile)
     if many:
         from exporter.cli.fleet import run_fleet
 
         run_fleet(sources, job, jobs, cluster, again, fail_fast, console)
-        return
+    else:
+        _export_few(sources, job, env, console)
+
+
+def _are_many(sources: Sequence[Path], out: Path) -> bool:
+    """Whether a fleet exports them: folders, globs and lists, or bundles that are sent to an address."""
+    from converters.files.fetch import address_of
+    from exporter.fleet.sources import is_many
+
+    return is_many(sources) or address_of(out) is not None
+
+
+def _export_few(sources: Sequence[Path], job: ExportOptions, env: str | None, console: Console) -> None:
+    """Export sources in this process, and leave with the status of what came of it."""
+    results, refused = _export_all(sources, job, console)
+    played: list[PlayReport] = [] if env is None else _play(env, sources[0], results, job, console)
+    told: dict[str, object] = {"refused": [e.to_dict() for e in refused]} if refused else {}
+    told |= {"play": [p.to_dict() for p in played]} if played else {}
+    console.json({"policies": [r.to_dict() for r in results], **told})
+    console.write_reports(lambda: _entries(results, job.parity.steps))
+    console.next_step(results, job.compile.names, job.profile)
+    status = 2 if refused else _status(results, played)
+    if status:
+        sys.exit(status)
+
+
+def _status(results: Sequence[ExportResult], played: Sequence[PlayReport]) -> int:
+    """Return 1 where formats disagree or play otherwise, 3 where a report is undecided, else 0."""
+    if any(r.passed is False for r in results) or any(p.passed is False for p in played):
+        return 1
+    return 3 if any(r.report is not None and r.report.undecided for r in results) else 0
+
+
+def _export_all(
+    sources: Sequence[Path], job: ExportOptions, console: Console
+) -> tuple[list[ExportResult], list[ExportModelError]]:
+    """Export sources one after the other, and print what came of each; return the results and what was refused."""
+    from exporter.export.pipeline import export
+
     results: list[ExportResult] = []
     refused: list[ExportModelError] = []
     with console.progress() as progress:
@@ -171,18 +204,7 @@ def export_command(
             progress.clear()
             console.print_result(result)
     console.print_summary([r.report for r in results if r.report is not None], refused=len(refused))
-    played: list[PlayReport] = [] if env is None else _play(env, sources[0], results, job, console)
-    told: dict[str, object] = {"refused": [e.to_dict() for e in refused]} if refused else {}
-    told |= {"play": [p.to_dict() for p in played]} if played else {}
-    console.json({"policies": [r.to_dict() for r in results], **told})
-    console.write_reports(lambda: _entries(results, options.steps))
-    console.next_step(results, compiling.names, profile)
-    if refused:
-        sys.exit(2)
-    if any(r.passed is False for r in results) or any(p.passed is False for p in played):
-        sys.exit(1)
-    if any(r.report is not None and r.report.undecided for r in results):
-        sys.exit(3)
+    return results, refused
 
 
 def _check_playable(env: str, sources: int, runtimes: str, profile: str | None) -> None:

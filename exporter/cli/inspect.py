@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -75,25 +76,22 @@ def inspect_command(
     from converters.compiler.options import CompileOptions
     from converters.files.fetch import path_text
     from exporter.remote.fetching import nearby
-    from exporter.tables import command_text
 
     if len(sources) > 1 and (logdir is not None or svg is not None):
         raise UsageError("--logdir and --svg are for one source", fix="name one")
     if not releases and (actions or brain_parameters is not None):
         raise UsageError("--actions and --brain-parameters are for --unity", fix="name a release: --unity R22")
-    unasked = {
-        "--logdir": logdir is not None,
-        "--why": why,
-        "--step": step is not None,
-        "--activation": activation is not None,
-        "--normaliser": normaliser is not None,
-        "--trust-source": trust_source,
-        "--brain, --input, --output or --set": compiling != CompileOptions(),
-    }
-    given = [flag for flag, value in unasked.items() if value]
-    if releases and given:
-        raise UsageError(
-            f"{given[0]} is not for --unity", why="the file is looked at as it is", fix=f"leave {given[0]} out"
+    if releases:
+        _check_looked_at(
+            {
+                "--logdir": logdir is not None,
+                "--why": why,
+                "--step": step is not None,
+                "--activation": activation is not None,
+                "--normaliser": normaliser is not None,
+                "--trust-source": trust_source,
+                "--brain, --input, --output or --set": compiling != CompileOptions(),
+            }
         )
     status, found = 0, list[dict[str, Any]]()
     for source in sources:
@@ -105,13 +103,8 @@ def inspect_command(
                     status = max(status, verdict)
                 else:
                     read = read_options(step, sensors, trust_source, activation, normaliser)
-                    refused: list[ExportModelError] = []
-                    answer = _inspect_source(here, compiling, read, logdir, svg, refused, as_json=as_json, why=why)
-                    for error in refused:
-                        say_lines(f"error: {error.message}", err=True)
-                        status = 2
-                    told = {"refused": [e.to_dict() for e in refused]} if refused else {}
-                    found.append({**answer, **told})
+                    found.append(_inspect_source(here, compiling, read, logdir, svg, as_json=as_json, why=why))
+                    status = 2 if "refused" in found[-1] else status
         except ExportModelError as error:
             if len(sources) == 1:
                 raise
@@ -121,10 +114,23 @@ def inspect_command(
     if as_json:
         say_json(found[0] if len(sources) == 1 else {"sources": found})
     elif not releases and status == 0:
-        both = as_given({p.name for p in export_command.params if p.name is not None} - {"as_json"})
-        say(f"next: {command_text(*map(path_text, sources), *both, '-o', 'exported')}")
+        _say_next(sources)
     if status:
         sys.exit(status)
+
+
+def _say_next(sources: Sequence[Path]) -> None:
+    from converters.files.fetch import path_text
+    from exporter.tables import command_text
+
+    both = as_given({p.name for p in export_command.params if p.name is not None} - {"as_json"})
+    say(f"next: {command_text(*map(path_text, sources), *both, '-o', 'exported')}")
+
+
+def _check_looked_at(given: Mapping[str, bool]) -> None:
+    """Raise UsageError where a flag was given that reads a file in some way: Unity takes it as it is."""
+    for flag in (flag for flag, value in given.items() if value):
+        raise UsageError(f"{flag} is not for --unity", why="the file is looked at as it is", fix=f"leave {flag} out")
 
 
 def _inspect_source(
@@ -133,16 +139,16 @@ def _inspect_source(
     read: ReadOptions,
     logdir: Path | None,
     svg: Path | None,
-    refused: list[ExportModelError],
     *,
     as_json: bool,
     why: bool,
 ) -> dict[str, Any]:
-    """Say what is in a source, unless it is all for a program, which gets what is returned; ``refused`` gets the errors
-    of a folder's files that could not be read.
+    """Say what is in a source, and which files of a folder could not be read; return it for a program, for which
+    nothing is printed but errors (``as_json``).
     """
     from exporter.inspect.inspection import inspect_source, inspection_text
 
+    refused: list[ExportModelError] = []
     found = inspect_source(source, compiling, read, refused, why=why)
     written: list[Path] = []
     if logdir is not None or svg is not None:
@@ -153,7 +159,10 @@ def _inspect_source(
         say_lines(inspection_text(found))
         for path in written:
             say(f"wrote {path}")
-    return {**found.to_dict(), **({"written": [str(path) for path in written]} if written else {})}
+    for error in refused:
+        say_lines(f"error: {error.message}", err=True)
+    answer = {**found.to_dict(), **({"written": [str(path) for path in written]} if written else {})}
+    return {**answer, **({"refused": [e.to_dict() for e in refused]} if refused else {})}
 
 
 def _unity(

@@ -233,7 +233,16 @@ def comparing(command: Callable[..., Any]) -> Callable[..., Any]:
         require = _required_formats(
             required, unverified=bool(rest.get("allow_unverified")) or rest.get("runtimes") == "none"
         )
-        options = VerifyOptions(seed, samples, steps, tolerance, console.rules(), golden, parse_budget(sizes), require)
+        options = VerifyOptions(
+            seed=seed,
+            samples=samples,
+            steps=steps,
+            tolerance=tolerance,
+            rules=console.rules(),
+            golden=golden,
+            budget=parse_budget(sizes),
+            require=require,
+        )
         return command(*args, console=console, options=options, **rest)
 
     for option in (

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -67,10 +68,7 @@ def verify_command(
 
     Given a folder of bundles, it verifies all of them.
     """
-    from converters.files.fetch import path_text
-    from converters.formats.bundle.bundle import bundles_in, other_folders_in
     from exporter.export.again import verify_folder
-    from exporter.export.pipeline import numbered_progress
     from exporter.remote.fetching import nearby
 
     console.prepare()
@@ -79,33 +77,45 @@ def verify_command(
 
         check_log_of(bundles, log, source, options, console)
         return
-    reports: list[ParityReport] = []
-    refused: list[ExportModelError] = []
-    with ExitStack() as fetched, console.progress() as progress:
+    with ExitStack() as fetched:
         near = [(given, fetched.enter_context(nearby(given))) for given in bundles]
-        places: list[tuple[Path, Path | None]] = []
-        for given, place in near:
-            whole, (broken, others) = bundles_in(place), other_folders_in(place)
-            places += [(found, None if given == place else given) for found in (*whole, *broken) or [place]]
-            if (whole or broken) and others and not console.quiet:
-                names = ", ".join(f"{p.name} (it holds some)" if bundles_in(p) else p.name for p in others)
-                say_lines(
-                    f"note: {path_text(given)} also holds folders that are not bundles: {printable(names)}", err=True
-                )
-        source = None if source is None else fetched.enter_context(nearby(source))
-        verified = []
-        for number, (folder, address) in enumerate(places, 1):
+        places = [found for given, place in near for found in _bundles_at(given, place, quiet=console.quiet)]
+        verifying = partial(
+            verify_folder,
+            source=None if source is None else fetched.enter_context(nearby(source)),
+            step=step,
+            trust_source=trust_source,
+            runtimes=runtimes,
+            options=options,
+            allow_unverified=allow_unverified,
+        )
+        verified, refused = _verify_all(places, verifying, console)
+        reports = [report for _, report in verified]
+        console.print_summary(reports, refused=len(refused))
+        console.check_rules(reports)
+        told = {"refused": [e.to_dict() for e in refused]} if refused else {}
+        console.json({"reports": [r.to_dict() for r in reports], **told})
+        if reports:
+            console.write_reports(lambda: _bundle_entries(reports, [place for place, _ in verified], options.steps))
+    if refused:
+        sys.exit(2)
+    if any(r.passed is False for r in reports):
+        sys.exit(1)
+    if any(r.undecided for r in reports) and not allow_unverified:
+        sys.exit(3)
+
+
+def _verify_all(
+    places: Sequence[tuple[Path, Path | None]], verifying: Callable[..., ParityReport], console: Console
+) -> tuple[list[tuple[tuple[Path, Path | None], ParityReport]], list[ExportModelError]]:
+    """Verify bundles one after the other, and print what came of each; return the reports and what was refused."""
+    from exporter.export.pipeline import numbered_progress
+
+    verified, refused = [], list[ExportModelError]()
+    with console.progress() as progress:
+        for number, place in enumerate(places, 1):
             try:
-                report = verify_folder(
-                    folder,
-                    source=source,
-                    step=step,
-                    trust_source=trust_source,
-                    runtimes=runtimes,
-                    options=options,
-                    allow_unverified=allow_unverified,
-                    progress=numbered_progress(progress, number, len(places)),
-                )
+                report = verifying(place[0], progress=numbered_progress(progress, number, len(places)))
             except (UsageError, RuntimeUnavailableError):
                 raise
             except ExportModelError as error:
@@ -115,22 +125,22 @@ def verify_command(
                 progress.clear()
                 say_lines(f"error: {error.message}", err=True)
                 continue
-            reports.append(report)
-            verified.append((folder, address))
+            verified.append((place, report))
             progress.clear()
-            console.report_policy(report, folder)
-        console.print_summary(reports, refused=len(refused))
-        console.check_rules(reports)
-        told = {"refused": [e.to_dict() for e in refused]} if refused else {}
-        console.json({"reports": [r.to_dict() for r in reports], **told})
-        if reports:
-            console.write_reports(lambda: _bundle_entries(reports, verified, options.steps))
-    if refused:
-        sys.exit(2)
-    if any(r.passed is False for r in reports):
-        sys.exit(1)
-    if any(r.undecided for r in reports) and not allow_unverified:
-        sys.exit(3)
+            console.report_policy(report, place[0])
+    return verified, refused
+
+
+def _bundles_at(given: Path, place: Path, *, quiet: bool) -> list[tuple[Path, Path | None]]:
+    """Return each bundle of a folder, or the folder, with the address it is from; say what else lies there."""
+    from converters.files.fetch import path_text
+    from converters.formats.bundle.bundle import bundles_in, other_folders_in
+
+    whole, (broken, others) = bundles_in(place), other_folders_in(place)
+    if (whole or broken) and others and not quiet:
+        names = ", ".join(f"{p.name} (it holds some)" if bundles_in(p) else p.name for p in others)
+        say_lines(f"note: {path_text(given)} also holds folders that are not bundles: {printable(names)}", err=True)
+    return [(found, None if given == place else given) for found in (*whole, *broken) or [place]]
 
 
 def _bundle_entries(
