@@ -10,6 +10,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from converters.files.wire_format import read_varint
 from signatures.errors import NotAPolicyError
 
 #: Fields of a file, those of messages in messages too: a graph may have 131,072 nodes, of two dozen each.
@@ -29,6 +30,8 @@ Table: TypeAlias = "dict[int, Table | None]"
 _TABLES: dict[str, Table] = {}
 #: That of a group, which none of our messages has: protobuf passes over it whatever is in it, and reads on behind it.
 _GROUP: Table = {}
+#: Wire type → bytes of a field that always has so many.
+_FIXED = {1: 8, 5: 4}
 
 
 def check_size(message_class: Any, data: bytes) -> None:
@@ -87,10 +90,8 @@ def fields_of(data: bytes, table: Table, most: int) -> int:
                 while data[at] > 0x7F:
                     at += 1
                 at += 1
-            elif wire == 5:
-                at += 4
-            elif wire == 1:
-                at += 8
+            elif wire in _FIXED:
+                at += _FIXED[wire]
             elif wire == 3:
                 ends.append((end, table))
                 table = _GROUP
@@ -111,16 +112,11 @@ def _is_dense(data: bytes, start: int, end: int) -> bool:
 
 
 def _varint(data: bytes, at: int) -> tuple[int, int]:
-    value = shift = 0
-    while True:
-        byte = data[at]
-        at += 1
-        value |= (byte & 0x7F) << shift
-        if byte <= 0x7F:
-            return value & _MOST, at  # as protobuf in Python has it; in C it refuses what is cut here
-        shift += 7
-        if shift > 63:
-            raise IndexError
+    """A number, of which protobuf in Python keeps the low bits; in C it refuses what is cut here."""
+    value, at = read_varint(data, at, len(data))
+    if value < 0:
+        raise IndexError
+    return value & _MOST, at
 
 
 def _table(descriptor: Any) -> Table:
