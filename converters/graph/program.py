@@ -266,30 +266,22 @@ def _join(program: Program) -> None:
 
 
 def _join_once(program: Program) -> bool:
+    """Join each stage with those that it alone reads; return whether there were any."""
     made: dict[Any, Stage] = {s.result.place: s for s in program.stages}
     readers = Count(p for s in program.stages for p in {e.tensor.place for e in elements(s.body)})
     kept_places = {t.place for t in program.outputs.values()}
+    alone = {p: s for p, s in made.items() if readers[p] == 1 and p not in kept_places}
     gone: set[Any] = set()
     for stage in program.stages:
-        within = {id(e) for r in every(stage.body) if isinstance(r, Reduced) for e in every(r.body)}
-        reads: dict[Any, list[Element]] = {}
-        for e in elements(stage.body):
-            reads.setdefault(e.tensor.place, []).append(e)
         swap: dict[int, Expression] = {}
-        reducing, abouts = False, list[str]()
-        for place, found in reads.items():
-            before = made.get(place)
-            if before is None or readers[place] > 1 or place in kept_places:
-                continue
-            alike = all(id(e) not in within and _same_place(e, before, stage) for e in found)
-            if not alike or split_loop(before, before.body) or any(isinstance(x, Drawn) for x in every(before.body)):
-                continue
-            if _reduces(before.body) and (reducing or _reduces(stage.body)):
+        reducing, abouts = _reduces(stage.body), list[str]()
+        for place, found in _reads(stage, alone).items():
+            before = alone[place]
+            if reducing and _reduces(before.body):
                 continue
             reducing = reducing or _reduces(before.body)
             turned = {id(a): b for a, b in zip(before.counters, stage.counters, strict=True)}
-            body = inline_scalars(before.body, turned)
-            swap |= {id(e): body for e in found}
+            swap |= dict.fromkeys(map(id, found), inline_scalars(before.body, turned))
             gone.add(place)
             abouts.append(before.about)
         if swap:
@@ -297,6 +289,25 @@ def _join_once(program: Program) -> bool:
             stage.body = inline_scalars(stage.body, swap)
     program.stages = [s for s in program.stages if s.result.place not in gone]
     return bool(gone)
+
+
+def _is_whole(stage: Stage) -> bool:
+    """Whether a stage is one loop nest that gives the same wherever it runs."""
+    return not split_loop(stage, stage.body) and not any(isinstance(x, Drawn) for x in every(stage.body))
+
+
+def _reads(stage: Stage, made: Mapping[Any, Stage]) -> dict[Any, list[Element]]:
+    """Place → where a stage reads it, of those that it reads element by element, each in its own loops."""
+    within = {id(e) for r in every(stage.body) if isinstance(r, Reduced) for e in every(r.body)}
+    found: dict[Any, list[Element]] = {}
+    for e in elements(stage.body):
+        if e.tensor.place in made:
+            found.setdefault(e.tensor.place, []).append(e)
+    return {
+        place: read
+        for place, read in found.items()
+        if _is_whole(made[place]) and all(id(e) not in within and _same_place(e, made[place], stage) for e in read)
+    }
 
 
 def _reduces(x: Expression) -> bool:

@@ -135,22 +135,24 @@ def _results(
     except MISFIT as error:
         raise misfit(node, error) from error
     _check_size(node, args, results)
-    if op.kernel is None or not op.foldable or results[0].value is not None or not args:
+    known = [a.value for a in args if a.value is not None]
+    if op.kernel is None or not op.foldable or results[0].value is not None or not args or len(known) < len(args):
         return results
-    values = [a.value for a in args]
-    if any(v is None for v in values):
+    if not _may_fold(op, results, allowance):
         return results
-    sizes = [elements_of(r) for r in results]
-    large = sum(size for size in sizes if size > _SMALL)
-    least = min(large, 1) if op.moves in _VIEWS else large
-    if max(sizes, default=0) > _MAX_FOLD or (least > allowance.left and not allowance.take(least)):
-        return results
-    known = [v for v in values if v is not None]
     if all(v.dtype != object for v in known):
         folded: Sequence[TensorType] = [of_array(v) for v in run_kernel(op, node, known)]
     else:
         folded = _symbolic(op, node, args, known, results, symbols)
     return folded if allowance.take(_folded_elements(node, args, folded)) else results
+
+
+def _may_fold(op: OpDef, results: Sequence[TensorType], allowance: Allowance) -> bool:
+    """Whether results are small enough to be computed here; their elements are counted where they are large."""
+    sizes = [elements_of(r) for r in results]
+    large = sum(size for size in sizes if size > _SMALL)
+    least = min(large, 1) if op.moves in _VIEWS else large
+    return max(sizes, default=0) <= _MAX_FOLD and (least <= allowance.left or allowance.take(least))
 
 
 @cache

@@ -123,28 +123,29 @@ class LoadedPolicy:
         self._check_parameters(parameters or {})
         feeds: dict[str, Array] = {}
         rows: int | None = None
-        for spec in sorted(self.signature.inputs, key=lambda s: s.role not in OBSERVATIONS):
-            if spec.role in OBSERVATIONS:
-                array = self._fitting(spec, self._scale_bytes(spec, given.pop(spec.name)), rows)
-                check_ids(spec, array)
-                rows = len(array)
-            elif spec.role is Role.NOISE:
-                continue
-            elif spec.role is Role.PARAMETER:
-                array = np.asarray((parameters or {})[spec.name], spec.dtype)
-            else:
-                value = special.get(spec.role)
-                shape = tuple((rows or 1) if i == 0 else n or 1 for i, n in enumerate(spec.shape))
-                fill = 1 if spec.role is Role.MASKS else 0
-                array = np.full(shape, fill, spec.dtype) if value is None else self._fitting(spec, value, rows)
-                if spec.role is Role.MASKS and value is not None:
-                    self._check_masks(array)
-            feeds[spec.name] = array
-        count = rows or 1
+        for spec in self.signature.observations:
+            array = self._fitting(spec, self._scale_bytes(spec, given.pop(spec.name)), rows)
+            check_ids(spec, array)
+            feeds[spec.name], rows = array, len(array)
+        for spec in self.signature.inputs:
+            if spec.role is Role.PARAMETER:
+                feeds[spec.name] = np.asarray((parameters or {})[spec.name], spec.dtype)
+            elif spec.role is not Role.NOISE and spec.role not in OBSERVATIONS:
+                feeds[spec.name] = self._special(spec, special.get(spec.role), rows)
         for spec in self.signature.noise:
-            shape = tuple(count if n is None else n for n in spec.shape)
+            shape = tuple((rows or 1) if n is None else n for n in spec.shape)
             feeds[spec.name] = np.zeros(shape, np.float32) if deterministic else self._generator.normals(shape)
         return self._decision(self.run(feeds, [s.name for s in self.signature.outputs]), deterministic)
+
+    def _special(self, spec: TensorSpec, value: npt.ArrayLike | None, rows: int | None) -> Array:
+        """Masks, memory or previous actions: what is given, else all allowed, and zeros."""
+        if value is None:
+            shape = tuple((rows or 1) if i == 0 else n or 1 for i, n in enumerate(spec.shape))
+            return np.full(shape, 1 if spec.role is Role.MASKS else 0, spec.dtype)
+        array = self._fitting(spec, value, rows)
+        if spec.role is Role.MASKS:
+            self._check_masks(array)
+        return array
 
     def _check_plain(self) -> None:
         """Raise UsageError where an action is drawn inside the graph, and there is none without chance."""

@@ -178,29 +178,31 @@ def _describe(block: Block, graph: Graph) -> tuple[str, str]:
     ops = Counter(n.op for n in block.nodes)
     if block.kind == "input":
         return block.nodes[0].name, ""
-    first = block.nodes[0]
-    words = []
-    weights = graph.constant(first.inputs[1]) if _has_weights(first) and len(first.inputs) > 1 else None
-    if weights is not None and first.op == "Conv2D" and weights.ndim == 4:
-        strides = first.attrs.get("strides")
-        step = f" /{strides[1]}" if isinstance(strides, tuple) and strides[1] != 1 else ""
-        words.append(f"conv {weights.shape[0]}×{weights.shape[1]} → {weights.shape[3]}{step}")
-    elif weights is not None and first.op == "MatMul":
-        width = weights.shape[0 if first.attrs.get("transpose_b") else -1]
-        if ops["Sigmoid"] >= 3 and ops["Tanh"] >= 2:
-            words.append(f"LSTM {width // 4}")
-        else:
-            words.append(f"dense {width}")
-    elif _has_weights(first):
-        words.append("matrix product" if traits(first).layer == "dense" else "convolution")
-    elif "Sub" in ops and ("RealDiv" in ops or "Mul" in ops) and sum(ops.values()) <= _NORMALISER:
-        words.append("normalise")
-    elif any(map(_draws, block.nodes)):
-        words.append("draw")
-    words += _activations(block.nodes, ops, lstm=bool(words) and words[0].startswith("LSTM"))
+    title = _layer_title(block.nodes[0], graph, ops)
+    if title is None and "Sub" in ops and ("RealDiv" in ops or "Mul" in ops) and sum(ops.values()) <= _NORMALISER:
+        title = "normalise"
+    elif title is None and any(map(_draws, block.nodes)):
+        title = "draw"
+    words = [] if title is None else [title]
+    words += _activations(block.nodes, ops, lstm=title is not None and title.startswith("LSTM"))
     if not words:
         words = [_plain_title(block.nodes)]
     return ", ".join(words), " · ".join(op if n == 1 else f"{op} ×{n}" for op, n in ops.items())
+
+
+def _layer_title(first: Node, graph: Graph, ops: Mapping[str, int]) -> str | None:
+    """What a box that begins with weights is called, with its sizes where they are known; None for others."""
+    if not _has_weights(first):
+        return None
+    weights = graph.constant(first.inputs[1]) if len(first.inputs) > 1 else None
+    if weights is not None and first.op == "Conv2D" and weights.ndim == 4:
+        strides = first.attrs.get("strides")
+        step = f" /{strides[1]}" if isinstance(strides, tuple) and strides[1] != 1 else ""
+        return f"conv {weights.shape[0]}×{weights.shape[1]} → {weights.shape[3]}{step}"
+    if weights is not None and first.op == "MatMul":
+        width = weights.shape[0 if first.attrs.get("transpose_b") else -1]
+        return f"LSTM {width // 4}" if ops["Sigmoid"] >= 3 and ops["Tanh"] >= 2 else f"dense {width}"
+    return "matrix product" if traits(first).layer == "dense" else "convolution"
 
 
 def _activations(nodes: Iterable[Node], ops: Mapping[str, int], *, lstm: bool) -> list[str]:

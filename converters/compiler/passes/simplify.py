@@ -7,6 +7,7 @@ length 1 is one Reshape or none; everything left is upstream of ``roots``.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from converters.graph.nodes import Graph, Node
 from converters.graph.ops.slicing import strided_steps
 from converters.graph.ops.table import op_of, traits
 from converters.graph.shapes import Types, infer_types
-from converters.graph.types import INT32
+from converters.graph.types import INT32, Dim
 
 
 def drop_identities(graph: Graph, fetches: Mapping[str, str]) -> tuple[Graph, dict[str, str]]:
@@ -76,27 +77,26 @@ def _is_view(node: Node, types: Types) -> bool:
         return False
     if node.op == "Transpose":
         permutation = types[node.inputs[1]].constant
-        if permutation is None:
-            return False
-        moved = [int(p) for p in permutation if before[int(p)] != 1]
-        return moved == sorted(moved)
-    if node.op == "StridedSlice":
-        operands = [types[r].constant for r in node.inputs[1:4]]
-        if any(o is None for o in operands):
-            return False
-        steps = strided_steps(node, len(before), *(o.tolist() for o in operands if o is not None))
-        lengths = iter(before)
-        for step in steps:
-            if step[0] == "new":
-                continue
-            length = next(lengths)
-            if step[0] == "take" and length != 1:
-                return False
-            if step[0] == "slice" and step[1:] not in ((None, None, 1), (0, None, 1)):
-                first, last, stride = step[1:]
-                if not isinstance(length, int) or len(range(*slice(first, last, stride).indices(length))) != length:
-                    return False
-                if stride < 0 and length != 1:
-                    return False
+        moved = None if permutation is None else [int(p) for p in permutation if before[int(p)] != 1]
+        return moved is not None and moved == sorted(moved)
+    return node.op == "StridedSlice" and _takes_all(node, types, before)
+
+
+def _takes_all(node: Node, types: Types, before: tuple[Dim, ...]) -> bool:
+    """Whether a slice takes every element of a tensor of shape ``before``, in its order."""
+    operands = [types[r].constant for r in node.inputs[1:4]]
+    if any(o is None for o in operands):
+        return False
+    steps = strided_steps(node, len(before), *(o.tolist() for o in operands if o is not None))
+    taken = [step for step in steps if step[0] != "new"]
+    return all(_takes_axis(step, length) for step, length in zip(taken, before, strict=False))
+
+
+def _takes_axis(step: tuple[Any, ...], length: Dim) -> bool:
+    if step[0] == "take":
+        return bool(length == 1)
+    if step[0] != "slice" or step[1:] in ((None, None, 1), (0, None, 1)):
         return True
-    return False
+    first, last, stride = step[1:]
+    whole = isinstance(length, int) and len(range(*slice(first, last, stride).indices(length))) == length
+    return whole and (stride > 0 or length == 1)

@@ -185,36 +185,52 @@ def reduce(b: NnBuilder, args: Sequence[Value]) -> Value:
 
 
 def _reduce(b: NnBuilder, value: Value, name: str, places: Sequence[int | None], *, whole: bool) -> str:
+    reduced = None
+    if b.node.op not in _REDUCED:
+        reduced = _sum(b, value, name, places, whole=whole, mean=traits(b.node).takes == "mean")
+    elif _REDUCED[b.node.op] is LayerType.REDUCE_MAX and C not in places:
+        reduced = _pool_places(b, LayerType.MAX_POOL2D, value, name, places)[0]
+    elif whole and len(places) > 1:
+        n, h, w, c = value.dims
+        flat = b.layer(LayerType.FLATTEN, [name], (n, 1, 1, h * w * c), label="flat")
+        reduced = b.layer(_REDUCED[b.node.op], [flat], (n, 1, 1, 1))
+    elif places == [C]:
+        reduced = b.layer(_REDUCED[b.node.op], [name], (*value.dims[:3], 1))
+    if reduced is None:
+        what = f"a {b.node.op} of {list(value.shape)} over part of the image"
+        raise b.nn_error(what, "version 16 reduces over the channels")
+    return reduced
+
+
+def _sum(b: NnBuilder, value: Value, name: str, places: Sequence[int | None], *, whole: bool, mean: bool) -> str | None:
+    """A sum or mean: a product with ones, or a pool; None where it is over channels and part of the image."""
     n, h, w, c = value.dims
-    op, width = b.node.op, h * w * c
-    summed, mean = op not in _REDUCED, traits(b.node).takes == "mean"
-    # All pixels of each channel: what is left of the image is one.
-    pixels = C not in places and all(length == 1 or place in places for place, length in ((1, h), (2, w)))
-    if summed and whole:
+    width = h * w * c
+    if whole:
         b.made_up(width)
-        share = 1 / width if mean else 1.0
-        return b.dense(name, np.full((width, 1), share), np.zeros(1))
-    if summed and pixels:
+        return b.dense(name, np.full((width, 1), 1 / width if mean else 1.0), np.zeros(1))
+    # All pixels of each channel: what is left of the image is one.
+    if C not in places and all(length == 1 or place in places for place, length in ((1, h), (2, w))):
         pooled = b.layer(LayerType.GLOBAL_AVG_POOL2D, [name], (n, 1, 1, c), label="" if mean else "mean")
         return pooled if mean else b.scale(pooled, h * w)
-    if summed and places == [C]:
+    if places == [C]:
         kernel = np.full((1, 1, c, 1), 1 / c if mean else 1.0)
         data = [("kernel", kernel), ("bias", np.zeros((1, 1, 1, 1)))]
         return b.layer(LayerType.CONV2D, [name], (n, h, w, 1), stride=(1, 1), data=data)
-    largest = _REDUCED.get(op) is LayerType.REDUCE_MAX
-    if (summed or largest) and C not in places:
-        kind = LayerType.MAX_POOL2D if largest else LayerType.AVG_POOL2D
-        down, across = (h if 1 in places else 1), (w if 2 in places else 1)
-        pooled = b.layer(
-            kind, [name], (n, h // down, w // across, c), pool=(across, down), stride=(across, down), label="pooled"
-        )
-        return b.scale(pooled, down * across) if summed and not mean else pooled
-    if op in _REDUCED and whole and len(places) > 1:
-        name = b.layer(LayerType.FLATTEN, [name], (n, 1, 1, width), label="flat")
-        return b.layer(_REDUCED[op], [name], (n, 1, 1, 1))
-    if op in _REDUCED and places == [C]:
-        return b.layer(_REDUCED[op], [name], (n, h, w, 1))
-    raise b.nn_error(f"a {op} of {list(value.shape)} over part of the image", "version 16 reduces over the channels")
+    if C in places:
+        return None
+    pooled, count = _pool_places(b, LayerType.AVG_POOL2D, value, name, places)
+    return pooled if mean else b.scale(pooled, count)
+
+
+def _pool_places(
+    b: NnBuilder, kind: LayerType, value: Value, name: str, places: Sequence[int | None]
+) -> tuple[str, int]:
+    """(a pool over all rows, all columns or both of an image, over how many pixels)."""
+    n, h, w, c = value.dims
+    down, across = (h if 1 in places else 1), (w if 2 in places else 1)
+    dims, size = (n, h // down, w // across, c), (across, down)
+    return b.layer(kind, [name], dims, pool=size, stride=size, label="pooled"), down * across
 
 
 def softmax(b: NnBuilder, args: Sequence[Value]) -> Value:

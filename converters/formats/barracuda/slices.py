@@ -35,22 +35,9 @@ def with_slices(model: NnModel) -> tuple[NnModel, tuple[str, ...]]:
     logits = {name for name in shared if name in layers and len(layers[name].inputs) == len(parts)}
     joined = [name for name in logits if layers[name].type == LayerType.CONCAT]
     widths = _widths(layers, joined, int(total))
-    apart = sum(map(len, own)) == len(set().union(*own))
-    sliced = any(layers[name].type == LayerType.STRIDED_SLICE for names in own for name in names if name in layers)
-    if not widths or not apart or sliced:
+    if not widths or not _has_no_slice(own, layers):
         return model, ()
-    cuts: dict[str, Layer] = {}
-    readers: dict[str, Layer] = {}
-    for names, begin, width in zip(own, itertools.accumulate(widths, initial=0), widths, strict=False):
-        for name in names & set(layers):
-            layer = layers[name]
-            whole = [i for i in layer.inputs if i in (*joined, _MASKS)]
-            for given in whole:
-                cut = _slice(given, begin, width)
-                cuts[cut.name] = cut
-            if whole:
-                own_inputs = tuple(_slice(i, begin, width).name if i in whole else i for i in layer.inputs)
-                readers[name] = replace(layer, inputs=own_inputs)
+    readers, cuts = _cut(layers, own, widths, (*joined, _MASKS))
     if not readers or set(cuts) & set(layers):
         return model, ()
     note = (
@@ -59,6 +46,29 @@ def with_slices(model: NnModel) -> tuple[NnModel, tuple[str, ...]]:
         "the same up to a constant per branch, so that it draws and chooses the same"
     )
     return replace(model, layers=tuple(_place_slices(model.layers, readers, cuts))), (note,)
+
+
+def _has_no_slice(own: Sequence[set[str]], layers: Mapping[str, Layer]) -> bool:
+    """Whether no layer is of two branches, and none of a branch is a slice."""
+    every = [name for names in own for name in names]
+    sliced = any(layers[name].type == LayerType.STRIDED_SLICE for name in every if name in layers)
+    return len(every) == len(set(every)) and not sliced
+
+
+def _cut(
+    layers: Mapping[str, Layer], own: Sequence[set[str]], widths: Sequence[int], whole: Sequence[str]
+) -> tuple[dict[str, Layer], dict[str, Layer]]:
+    """(the layers of each branch that read a tensor of ``whole``, reading their slice of it; these slices), by name."""
+    cuts: dict[str, Layer] = {}
+    readers: dict[str, Layer] = {}
+    for names, begin, width in zip(own, itertools.accumulate(widths, initial=0), widths, strict=False):
+        for name in names & set(layers):
+            parts = {given: _slice(given, begin, width) for given in layers[name].inputs if given in whole}
+            cuts.update({cut.name: cut for cut in parts.values()})
+            if parts:
+                inputs = tuple(parts[i].name if i in parts else i for i in layers[name].inputs)
+                readers[name] = replace(layers[name], inputs=inputs)
+    return readers, cuts
 
 
 def _parts(layers: Mapping[str, Layer]) -> Sequence[str]:

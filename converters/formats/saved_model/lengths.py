@@ -32,7 +32,7 @@ def without_counted(definition: Any, signature: ModelSignature) -> ModelSignatur
         ends = [] if name in given else list(_ends(name, readers, given))
         if dims == (None,) and ends and all(n is not None and n.op == "Shape" for n in ends):
             counted[key] = ends
-        elif dims is not None and len(dims) > 1 and dims[0] is None and any(n is None or n.op != "Shape" for n in ends):
+        elif _are_rows(dims) and any(n is None or n.op != "Shape" for n in ends):
             seen.append((key.startswith("1"), tensor))  # 1/… are memories
     if not counted or not seen:
         return signature
@@ -42,6 +42,11 @@ def without_counted(definition: Any, signature: ModelSignature) -> ModelSignatur
     for shape in (node for ends in counted.values() for node in ends):
         _count(definition, shape, other.name, dtype_number(other.dtype))
     return replace(signature, inputs={k: t for k, t in signature.inputs.items() if k not in counted})
+
+
+def _are_rows(dims: tuple[int | None, ...] | None) -> bool:
+    """Whether a tensor has a row for each agent."""
+    return dims is not None and len(dims) > 1 and dims[0] is None
 
 
 def _ends(name: str, readers: dict[str, list[Any]], given: set[str]) -> Iterator[Any | None]:

@@ -69,15 +69,7 @@ def _written_out(
     """(terms, tensors, result) with a label for each axis of a ``…``. The axes are counted from the last, as numpy
     broadcasts; one of length 1 is taken off where another operand has it longer.
     """
-    axes: list[Sequence[Dim]] = []
-    for term, shape in zip(terms, shapes, strict=True):
-        if shape is None and "." in term:
-            raise UnsupportedOpError("the rank of an operand is not known", why="the axes of its '...' must be counted")
-        begin = term.find("...")
-        count = len(shape or ()) - len(term) + 3
-        if begin >= 0 and count < 0:
-            raise UnsupportedOpError(f"an operand of rank {len(shape or ())} does not fit {term!r}")
-        axes.append(() if begin < 0 else (shape or ())[begin : begin + count])
+    axes = [_dotted_axes(term, shape) for term, shape in zip(terms, shapes, strict=True)]
     most = max(map(len, axes))
     if most and "." not in result:
         raise UnsupportedOpError("the axes of its '...' are not in its result")
@@ -95,6 +87,17 @@ def _written_out(
         made.append(tensor)
         written.append(term.replace("...", "".join(c for i, c in enumerate(mine) if i not in single)))
     return written, made, result.replace("...", "".join(labels))
+
+
+def _dotted_axes(term: str, shape: Shape) -> Sequence[Dim]:
+    """The lengths of the axes that the ``…`` of a term stands for; none where it has no dots."""
+    if shape is None and "." in term:
+        raise UnsupportedOpError("the rank of an operand is not known", why="the axes of its '...' must be counted")
+    begin = term.find("...")
+    count = len(shape or ()) - len(term) + 3
+    if begin >= 0 and count < 0:
+        raise UnsupportedOpError(f"an operand of rank {len(shape or ())} does not fit {term!r}")
+    return () if begin < 0 else (shape or ())[begin : begin + count]
 
 
 def _contract(b: NodeBuilder, tensors: Sequence[str], terms: Sequence[str], result: str, name: str) -> str:

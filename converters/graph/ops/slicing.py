@@ -251,26 +251,35 @@ def _litert_strided_slice(node: Node, builder: LitertBuilder) -> Value:
     if operands is None or kind.shape is None:
         raise not_constant(node, "the bounds of a slice")
     steps = strided_steps(node, len(kind.shape), *operands)
-    taken = [s for s in steps if s[0] != "new"]
-    bounds = [(s[1], s[1] + 1, 1) if s[0] == "take" else s[1:] for s in taken]
-    open_begin = sum(1 << i for i, (first, _, _) in enumerate(bounds) if first is None)
-    open_end = sum(1 << i for i, (_, last, _) in enumerate(bounds) if last is None)
-    shrunk = sum(1 << i for i, s in enumerate(taken) if s[0] == "take")
-    vectors = [ints(builder, *(0 if b[i] is None else b[i] for b in bounds)) for i in range(3)]
-    value, result = builder.value(node.inputs[0]), builder.result
+    result = builder.result
     new, position = [], 0
     for step in steps:
         new += [position] if step[0] == "new" else []
         position += step[0] != "take"
     dims = None if result.shape is None else tuple(d for i, d in enumerate(result.shape) if i not in new)
-    if any(b != (None, None, 1) for b in bounds):
-        masks = {"begin_mask": open_begin, "end_mask": open_end, "shrink_axis_mask": shrunk}
-        value = builder.emit("STRIDED_SLICE", [value, *vectors], TensorType(kind.dtype, dims), **masks)
+    value = _litert_bounds(builder, node.inputs[0], [s for s in steps if s[0] != "new"], TensorType(kind.dtype, dims))
     for count, axis in enumerate(new, 1):
         last = count == len(new) or dims is None
         dims = insert_axis(dims, axis)
         value = with_axis(builder, value, result if last else TensorType(kind.dtype, dims), axis)
     return value
+
+
+def _litert_bounds(
+    builder: LitertBuilder, reference: str, taken: Sequence[tuple[Any, ...]], result: TensorType
+) -> Value:
+    """A STRIDED_SLICE of the axes that are there; the value itself where all of each is taken."""
+    bounds = [(s[1], s[1] + 1, 1) if s[0] == "take" else s[1:] for s in taken]
+    vectors = [ints(builder, *(0 if b[i] is None else b[i] for b in bounds)) for i in range(3)]
+    value = builder.value(reference)
+    if all(b == (None, None, 1) for b in bounds):
+        return value
+    masks = {
+        "begin_mask": sum(1 << i for i, (first, _, _) in enumerate(bounds) if first is None),
+        "end_mask": sum(1 << i for i, (_, last, _) in enumerate(bounds) if last is None),
+        "shrink_axis_mask": sum(1 << i for i, s in enumerate(taken) if s[0] == "take"),
+    }
+    return builder.emit("STRIDED_SLICE", [value, *vectors], result, **masks)
 
 
 def _loops_strided_slice(node: Node, builder: LoopBuilder) -> Tensor:

@@ -349,35 +349,37 @@ def _from_user(
     given = [*modules, *[None] * (len(told) - len(modules))]
     if len(given) != len(told):
         raise _contradiction(told, f"its network has {len(modules)} sensors")
-    sensors: list[Sensor] = []
     columns = 0
-    for shape, module in zip(told, given, strict=True):
+    for number, (shape, module) in enumerate(zip(told, given, strict=True)):
         length = None if module is None else lengths.get(module)
         if length is not None or len(shape) == 2:
             if len(shape) != 2 or length != shape[1]:
                 known = "no list of entities" if length is None else f"a list of entities of {length} numbers"
-                raise _contradiction(told, f"its sensor {len(sensors)} is {known}")
-            sensors.append(Sensor(tuple(shape), module))
-            continue
-        encoder = None if module is None else encoder_of(state, module)
-        if (len(shape) == 3) != (encoder is not None):
-            place = "without weights" if module is None else module
-            raise _contradiction(
-                told, f"its sensor {len(sensors)} ({place}) is {'an image' if encoder else 'a vector'}"
-            )
-        if module is None or encoder is None:
-            columns += shape[0]
-            if module is not None and state.shape(f"{module}.normalizer.running_mean") != shape:
-                raise _contradiction(
-                    told, f"{module} has {state.length(f'{module}.normalizer.running_mean', 0)} numbers"
-                )
+                raise _contradiction(told, f"its sensor {number} is {known}")
         else:
-            _check_image(state, module, encoder, shape, told)
-            columns += _known_width(state, module)
-        sensors.append(Sensor(tuple(shape), module))
+            columns += _columns_as_told(state, number, module, shape, told)
     if columns != width:
         raise _contradiction(told, f"its first layer takes {width} columns, and these sensors give {columns}")
-    return sensors
+    return [Sensor(tuple(shape), module) for shape, module in zip(told, given, strict=True)]
+
+
+def _columns_as_told(
+    state: Weights, number: int, module: str | None, shape: tuple[int, ...], told: Sequence[tuple[int, ...]]
+) -> int:
+    """Columns of the first layer that a vector or an image takes. Raises UsageError where its shape is another."""
+    encoder = None if module is None else encoder_of(state, module)
+    if (len(shape) == 3) != (encoder is not None):
+        place = "without weights" if module is None else module
+        raise _contradiction(told, f"its sensor {number} ({place}) is {'an image' if encoder else 'a vector'}")
+    if module is None:
+        return shape[0]
+    if encoder is not None:
+        _check_image(state, module, encoder, shape, told)
+        return _known_width(state, module)
+    mean = f"{module}.normalizer.running_mean"
+    if state.shape(mean) != shape:
+        raise _contradiction(told, f"{module} has {state.length(mean, 0)} numbers")
+    return shape[0]
 
 
 def _check_image(

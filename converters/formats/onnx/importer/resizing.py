@@ -43,26 +43,27 @@ def _resize(op: Op, net: Importer) -> str:
         numbers = np.array([np.floor(ratio * net.length(x, a) + 0.5) for a in axes])
     elif sizes is None:
         numbers = np.array([_scaled_length(dims[a], s) for a, s in zip(axes, numbers, strict=True)])
+    told = None if sizes is not None else scales
     for i, axis in enumerate(axes):
-        if (
-            _stays(dims[axis], numbers[i], None if sizes is not None or scales is None else scales[i])
-            and region is None
-        ):
+        if region is None and _stays(dims[axis], numbers[i], None if told is None else told[i]):
             continue
-        length = net.length(x, axis)
-        scale = numbers[i] / length if sizes is not None or scales is None else scales[i]
-        how = Resampling(
-            op.text("mode", "nearest"),
-            coordinates,
-            op.text("nearest_mode", "floor" if old else "round_prefer_floor"),
-            op.number("cubic_coeff_a", -0.75),
-            bool(op.integer("exclude_outside", 0)),
-            bool(op.integer("antialias", 0)),
-            op.number("extrapolation_value", 0.0),
-            (0.0, 1.0) if region is None else (region[i], region[i + len(axes)]),
-        )
-        x = resample(net, x, axis, int(numbers[i]), float(scale), how)
+        scale = numbers[i] / net.length(x, axis) if told is None else told[i]
+        part = (0.0, 1.0) if region is None else (region[i], region[i + len(axes)])
+        x = resample(net, x, axis, int(numbers[i]), float(scale), _resampling(op, coordinates, part))
     return x
+
+
+def _resampling(op: Op, coordinates: str, region: tuple[float, float]) -> Resampling:
+    return Resampling(
+        mode=op.text("mode", "nearest"),
+        coordinates=coordinates,
+        nearest=op.text("nearest_mode", "floor" if op.opset < 11 else "round_prefer_floor"),
+        cubic=op.number("cubic_coeff_a", -0.75),
+        exclude_outside=bool(op.integer("exclude_outside", 0)),
+        antialias=bool(op.integer("antialias", 0)),
+        outside=op.number("extrapolation_value", 0.0),
+        region=region,
+    )
 
 
 def _scaled_length(dim: Dim, scale: float) -> float:
