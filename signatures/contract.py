@@ -153,14 +153,14 @@ def parse(content: Any) -> Contract:
     signature = parse_signature(whole)
     source, tool = whole["source"], whole["tool"]
     origin = Origin(
-        source["path"].text(),
-        _sha256(source["sha256"]),
-        None if source["model"].missing else source["model"].text(blank=True),
-        None if source["step"].missing else source["step"].integer(-(2**63)),
-        tuple(tuple(n.integer(1) for n in shape.items(8)) for shape in source["sensors"].items(1000)),
-        tuple(n.integer(0) for n in source["goals"].items(1000)),
-        None if source["activation"].missing else source["activation"].text(),
-        None if source["normaliser"].missing else source["normaliser"].text(),
+        path=source["path"].text(),
+        sha256=_sha256(source["sha256"]),
+        model=None if source["model"].missing else source["model"].text(blank=True),
+        step=None if source["step"].missing else source["step"].integer(-(2**63)),
+        sensors=tuple(tuple(n.integer(1) for n in shape.items(8)) for shape in source["sensors"].items(1000)),
+        goals=tuple(n.integer(0) for n in source["goals"].items(1000)),
+        activation=None if source["activation"].missing else source["activation"].text(),
+        normaliser=None if source["normaliser"].missing else source["normaliser"].text(),
     )
     entries = whole["files"].members()
     files = {_key(p, e): FileEntry(_sha256(e["sha256"]), e["bytes"].integer(0)) for p, e in entries.items()}

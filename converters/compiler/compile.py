@@ -120,7 +120,18 @@ def compilations(graph: Graph, options: CompileOptions, facts: SourceFacts) -> l
         pins = [Node(fetches[out], "Identity", (reference,), origin=sources[out]) for out, reference in outputs]
         pinned = Graph(topological([*upstream.nodes, *pins]))
         roles = {n: r for n, r in roles.items() if n in upstream}
-        c = Compilation(pinned, brain, options, facts, original, pinned, roles, fetches, sources, joined.parts)
+        c = Compilation(
+            graph=pinned,
+            brain=brain,
+            options=options,
+            facts=facts,
+            original=original,
+            source=pinned,
+            roles=roles,
+            fetches=fetches,
+            sources=sources,
+            parts=joined.parts,
+        )
         found.append((brain.label if len(brains) > 1 else "", c))
     return found
 

@@ -124,14 +124,14 @@ def contract_of(
 ) -> Contract:
     """The contract as every artefact embeds it. Raises SignatureError where it could not be read back."""
     origin = Origin(
-        printable(source.path.name or source.path.absolute().name),  # of the current folder
-        source.sha256,
-        None if model.name is None else printable(model.name),
-        read.step,
-        read.sensors,
-        read.goals,
-        read.activation,
-        None if read.normaliser is None else printable(Path(read.normaliser).name),
+        path=printable(source.path.name or source.path.absolute().name),  # of the current folder
+        sha256=source.sha256,
+        model=None if model.name is None else printable(model.name),
+        step=read.step,
+        sensors=read.sensors,
+        goals=read.goals,
+        activation=read.activation,
+        normaliser=None if read.normaliser is None else printable(Path(read.normaliser).name),
     )
     said = None if code is None else code.to_dict() or None
     tool = without_none(

@@ -237,7 +237,14 @@ class Exporter:
             failed = report is not None and report.passed is False
             place = put(stage, f"{policy.name}.failed" if failed else policy.name)
         return ExportResult(
-            policy, place, contract, {a.format.key: a.size for a in artifacts}, report, job.note, (), whole_sizes
+            policy=policy,
+            folder=place,
+            agreed=contract,
+            sizes={a.format.key: a.size for a in artifacts},
+            report=report,
+            renamed=job.note,
+            left_out=(),
+            whole_sizes=whole_sizes,
         )
 
 

@@ -154,14 +154,14 @@ def inspect_source(
         decisions = decided.get(policy.name, ())
         found.append(PolicyInspection(policy, ops, targets, parameters, layers, decisions))
     return Inspection(
-        source.path,
-        source.format.label,
-        source.sha256,
-        source.size,
-        sum(len(m.graph.nodes) for m in source.models),
-        found,
-        [(safe_name(source.stem(m)), m.graph) for m in source.models],
-        "; ".join(dict.fromkeys(m.producer for m in source.models if m.producer)),
+        path=source.path,
+        kind=source.format.label,
+        sha256=source.sha256,
+        size=source.size,
+        nodes=sum(len(m.graph.nodes) for m in source.models),
+        policies=found,
+        graphs=[(safe_name(source.stem(m)), m.graph) for m in source.models],
+        producer="; ".join(dict.fromkeys(m.producer for m in source.models if m.producer)),
     )
 
 

@@ -102,17 +102,17 @@ def _recording(
     before = np.where(begins, -1, last)
     pair = signature.recurrence
     return Recording(
-        complete(inputs, outputs, before, signature),
-        outputs,
-        before,
-        last,
-        halves,
-        int(begins.sum()),
-        tuple(name for name in arrays if name in IGNORED),
-        frozenset(inputs),
-        pair is not None and pair[0] not in inputs,
-        episode,
-        agent,
+        inputs=complete(inputs, outputs, before, signature),
+        outputs=outputs,
+        before=before,
+        last=last,
+        rounding=halves,
+        episodes=int(begins.sum()),
+        ignored=tuple(name for name in arrays if name in IGNORED),
+        logged=frozenset(inputs),
+        chained=pair is not None and pair[0] not in inputs,
+        episode=episode,
+        agent=agent,
     )
 
 

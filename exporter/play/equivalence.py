@@ -106,7 +106,17 @@ def equivalence(reference: np.ndarray, candidate: np.ndarray, margin: float) -> 
     else:
         verdict, needed = NOT_DECIDED, _episodes_needed(mean, deviation, margin, near)
     equal = int((differences == 0).sum())
-    return Equivalence(verdict, mean, mean - near, mean + near, margin, deviation, count, equal, needed)
+    return Equivalence(
+        verdict=verdict,
+        difference=mean,
+        low=mean - near,
+        high=mean + near,
+        margin=margin,
+        deviation=deviation,
+        episodes=count,
+        equal=equal,
+        needed=needed,
+    )
 
 
 def _episodes_needed(mean: float, deviation: float, margin: float, near: float) -> int | None:

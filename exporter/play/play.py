@@ -87,16 +87,16 @@ def play_policy(
     if match.reference is None:
         raise RunFailedError("the reference cannot play", why="\n".join(c.sentence() for c in report.failures) or None)
     return PlayReport(
-        match.policy.name,
-        match.world_name,
-        options,
-        match.margin,
-        match.reference_name,
-        match.reference,
-        tuple(match.played),
-        report,
-        match.recorded,
-        match.notes,
+        policy=match.policy.name,
+        environment=match.world_name,
+        options=options,
+        margin=match.margin,
+        reference=match.reference_name,
+        episodes=match.reference,
+        played=tuple(match.played),
+        replay=report,
+        recorded=match.recorded,
+        notes=match.notes,
     )
 
 

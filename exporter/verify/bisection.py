@@ -240,15 +240,15 @@ def _bisection_at(
     at = difference.worst
     index = None if at is None else tuple(int(i) for i in np.unravel_index(at, expected.shape))
     return Bisection(
-        tensor,
-        node.op,
-        source(node),
-        index,
-        None if index is None else float(expected[index]),
-        None if index is None else float(got[index]),
-        difference.max_abs,
-        difference.smallest_tolerance,
-        hidden,
+        tensor=tensor,
+        op=node.op,
+        source=source(node),
+        index=index,
+        expected=None if index is None else float(expected[index]),
+        got=None if index is None else float(got[index]),
+        max_abs_diff=difference.max_abs,
+        smallest_tolerance=difference.smallest_tolerance,
+        hidden=hidden,
         reason=difference.reason,
     )
 

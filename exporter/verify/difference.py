@@ -96,7 +96,17 @@ def compare(
     # A little more than the quotient: it was rounded, and a user who gives it must pass.
     smallest = float(needed.reshape(-1)[worst]) * (1 + 1e-12) if reference.dtype.kind == "f" else None
     histogram, share = decades(difference), float(shares(difference, bound).max())
-    return Difference(float(difference.max()), worst_relative, passed, "", explained, histogram, smallest, worst, share)
+    return Difference(
+        max_abs=float(difference.max()),
+        max_rel=worst_relative,
+        passed=passed,
+        reason="",
+        rounding=explained,
+        histogram=histogram,
+        smallest_tolerance=smallest,
+        worst=worst,
+        share=share,
+    )
 
 
 def shares(difference: np.ndarray, bound: np.ndarray) -> np.ndarray:

@@ -154,15 +154,15 @@ def _report(
     open_ = any(not f.passed and not f.disagrees for f in findings)
     passed = False if any(f.disagrees for f in findings) else True if independent and not open_ else None
     report = ParityReport(
-        tested.name,
-        passed,
-        options.seed,
-        options.samples,
-        reference,
-        states,
-        tuple(findings),
-        tested.sizes,
-        (*tested.signature.notes, *notes),
+        policy=tested.name,
+        passed=passed,
+        seed=options.seed,
+        samples=options.samples,
+        reference=reference,
+        runtimes=states,
+        comparisons=tuple(findings),
+        sizes=tested.sizes,
+        notes=(*tested.signature.notes, *notes),
         self_consistent=tested.source is None and not tested.runs_elsewhere,
         original=reference.removeprefix("source/") if reference.startswith("source/") else None,
     )

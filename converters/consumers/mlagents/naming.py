@@ -155,17 +155,17 @@ class Dressing(Struct, dict=True):
         )
         names = [s.name for s in signature.inputs], [s.name for s in signature.outputs]
         return Policy(
-            self.policy.name,
-            Graph((*work.nodes, *beside)),
-            signature,
-            {n: n for n in names[0]},
-            {n: n for n in names[1]},
-            SourceMap(
+            name=self.policy.name,
+            graph=Graph((*work.nodes, *beside)),
+            signature=signature,
+            feeds={n: n for n in names[0]},
+            fetches={n: n for n in names[1]},
+            source=SourceMap(
                 noise={s.name: s.shape for s in self.policy.signature.noise},
                 noise_kept=bool(self.policy.signature.noise),
             ),
-            dict(self.constants),
-            dict(self.kept),
+            constants=dict(self.constants),
+            kept=dict(self.kept),
         )
 
 

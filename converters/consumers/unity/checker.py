@@ -214,7 +214,9 @@ def _verdict_on_import(
     for name in modes_of(consumer):
         judged = _mode(model, consumer, agent, MODES[name], file)
         modes[name] = replace(judged, played=_play(judged, consumer, model, agent, file, nn))
-    return UnityVerdict(path, consumer, agent, None, modes, wrong, brain is None)
+    return UnityVerdict(
+        path=path, consumer=consumer, brain=agent, refused=None, modes=modes, misread=wrong, assumed=brain is None
+    )
 
 
 def _mode(

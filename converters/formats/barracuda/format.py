@@ -187,7 +187,16 @@ class _Parser:
         trailer = self._trailer(version) if self._at < len(self._data) else None
         if self._at != len(self._data):
             raise self._error(f"{len(self._data) - self._at} bytes follow the end", "they belong to nothing")
-        return NnModel(version, inputs, outputs, memories, layers, weights, half, trailer)
+        return NnModel(
+            version=version,
+            inputs=inputs,
+            outputs=outputs,
+            memories=memories,
+            layers=layers,
+            weights=weights,
+            half=half,
+            trailer=trailer,
+        )
 
     def _layer(self) -> Layer:
         name = self._text()

@@ -140,7 +140,19 @@ class NnBuilder:
         name = self.fresh(f"{self.node.name}/{label}" if label else self.node.name)
         named = tuple((f"{name}/{key}", np.ascontiguousarray(a, np.float32)) for key, a in data)
         self.drafts.append(
-            Draft(name, kind, tuple(inputs), activation, pad, stride, pool, axis, alpha, beta, named),
+            Draft(
+                name=name,
+                type=kind,
+                inputs=tuple(inputs),
+                activation=activation,
+                pad=pad,
+                stride=stride,
+                pool=pool,
+                axis=axis,
+                alpha=alpha,
+                beta=beta,
+                data=named,
+            ),
         )
         self._dims[name] = dims
         return name

@@ -97,17 +97,17 @@ def read_litert(data: bytes) -> LitertModel:
         return {name: Tensor(importer.values[n], tensors.dtype(n), dims[n]) for name, n in ports.items()}
 
     return LitertModel(
-        graph,
-        ModelSignature(side(inputs), side(outputs), key or None),
-        key,
-        {name: number for number, name in enumerate(tensors.names)},
-        {**outputs, **inputs},
-        int(called.get("subgraph_index", 0)),
-        tuple(k for k in named if k != key),
-        str(model.get("description", "")),
-        contract,
-        importer.widened,
-        importer.narrowed,
+        graph=graph,
+        signature=ModelSignature(side(inputs), side(outputs), key or None),
+        key=key,
+        tensors={name: number for number, name in enumerate(tensors.names)},
+        ports={**outputs, **inputs},
+        function=int(called.get("subgraph_index", 0)),
+        others=tuple(k for k in named if k != key),
+        description=str(model.get("description", "")),
+        contract=contract,
+        widened=importer.widened,
+        narrowed=importer.narrowed,
     )
 
 

@@ -92,26 +92,26 @@ def read_onnx(given: Fetched) -> OnnxModel:
     importer, types = reading.importer, reading.types
     outputs, left_out = _outputs(importer, [v.name for v in graph.output])
     return OnnxModel(
-        reading.graph,
-        (given.path, *files),
-        f"{model.producer_name} {model.producer_version}".strip(),
-        {v.name: importer.values[v.name] for v in declared},
-        outputs,
-        opsets[""],
-        tuple(importer.draws),
-        reading.batch,
-        {p.key: p.value for p in model.metadata_props},
-        left_out,
-        frozenset(n.op_type for n in all_nodes(graph)),
-        importer.one_row,
-        any(a.name == "seed" and a.type == _INT for n in graph.node for a in n.attribute),
-        any(t.data_type == _DOUBLE for t in tensors(graph))
+        graph=reading.graph,
+        files=(given.path, *files),
+        producer=f"{model.producer_name} {model.producer_version}".strip(),
+        inputs={v.name: importer.values[v.name] for v in declared},
+        outputs=outputs,
+        opset=opsets[""],
+        draws=tuple(importer.draws),
+        batch=reading.batch,
+        metadata={p.key: p.value for p in model.metadata_props},
+        left_out=left_out,
+        kinds=frozenset(n.op_type for n in all_nodes(graph)),
+        one_row=importer.one_row,
+        integer_seeds=any(a.name == "seed" and a.type == _INT for n in graph.node for a in n.attribute),
+        doubles=any(t.data_type == _DOUBLE for t in tensors(graph))
         or any(v.type.tensor_type.elem_type == _DOUBLE for v in declared),
-        {n: types[n].shape for n in (*(importer.values[v.name] for v in declared), *outputs.values())},
-        _joint(reading, memories, outputs),
-        reading.alone,
-        halves,
-        graph.name,
+        shapes={n: types[n].shape for n in (*(importer.values[v.name] for v in declared), *outputs.values())},
+        memories=_joint(reading, memories, outputs),
+        alone=reading.alone,
+        halves=halves,
+        name=graph.name,
         decisions={
             importer.values[n]: replace(d, tensor=importer.values[n])
             for n, d in found.decisions.items()

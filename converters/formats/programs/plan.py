@@ -69,7 +69,18 @@ def plan_of(policy: Policy, options: WriteOptions) -> Plan:
     weights = weights_of(program, options.weights, in_file=code.weights == "file")
     guarded = () if code.guard is None else _guarded(policy.name, header, code.guard)
     text = f"   {EMBEDDED}: {contract}\n*/"
-    return Plan(header, program, text, chosen, sizes, checked, golden, weights, code, guarded)
+    return Plan(
+        header=header,
+        program=program,
+        contract=text,
+        chosen=chosen,
+        sizes=sizes,
+        checked=checked,
+        golden=golden,
+        weights=weights,
+        code=code,
+        guarded=guarded,
+    )
 
 
 def _guarded(name: str, header: Header, most: float) -> tuple[Guarded, ...]:

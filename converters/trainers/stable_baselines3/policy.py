@@ -83,13 +83,13 @@ def to_graph(
     if isinstance(actions, dict):
         raise SourceError("its action space is a Dict", why="no policy of the library has one", fix=_EXPORT_ONNX)
     made = _Built(
-        Network(weights),
-        kwargs,
-        actions,
-        _activation(kwargs, family, activation),
-        family.squashed or _flag(kwargs, "squash_output"),
-        family.algorithm == "MaskablePPO",
-        normaliser,
+        net=Network(weights),
+        kwargs=kwargs,
+        actions=actions,
+        activation=_activation(kwargs, family, activation),
+        squashed=family.squashed or _flag(kwargs, "squash_output"),
+        maskable=family.algorithm == "MaskablePPO",
+        normaliser=normaliser,
     )
     observed = space_of(data, "observation_space")
     if normaliser is not None:
