@@ -43,8 +43,6 @@ def image(folder: Path, name: str) -> Path:
 @pytest.mark.parametrize(
     ("names", "maker"),
     [
-        ({"policy": ["net_container.0.weight", "log_std_parameter"], "optimizer": []}, "skrl"),
-        ({"policy": ["net.0.weight"], "state_preprocessor": ["running_mean"]}, "skrl"),
         ({"actor.preprocess.model.model.0.weight": None}, "Tianshou"),
         ({"model.model.model.0.weight": None}, "Tianshou"),
         ({"encoder.actor_encoder.net.mlp.0.weight": None}, "RLlib"),
