@@ -7,7 +7,7 @@ import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
-from signatures.records import dataclass
+from msgspec import Struct
 
 from converters.runtimes.javascript.node import node_executable
 
@@ -16,8 +16,7 @@ WARNINGS = ("-Wall", "-Wextra", "-Wconversion", "-Werror")
 CORTEX = ("-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16")
 
 
-@dataclass
-class Machine:
+class Machine(Struct, frozen=True):
     """``build`` makes of ``main.c`` in a folder what the command runs; ``missing`` says what is not installed."""
 
     name: str
