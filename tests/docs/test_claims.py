@@ -8,8 +8,10 @@ from pathlib import Path
 import click
 import pytest
 
+from converters.consumers.profiles import PROFILES, profile
 from converters.formats.registry import WRITTEN
 from exporter.cli.app import app
+from exporter.snippets.registry import TARGETS
 from exporter.verify import rounding, statistics
 from exporter.verify.checks import decisions, draws
 from exporter.verify.difference import SHARE, SIZE
@@ -17,7 +19,7 @@ from exporter.verify.options import VerifyOptions
 from exporter.verify.tolerances import ATOL, RTOL, Tolerance, tolerance_for
 from exporter.verify.work import SECONDS
 from signatures.sampling import LARGE_BATCH, MOST_IDS
-from tests.commands import ROOT
+from tests.commands import ROOT, export_model
 from tests.docs.blocks import name_of, pages
 
 #: Options of other programs that the pages show.
@@ -114,3 +116,50 @@ def test_the_verdict_that_readme_shows_is_one_that_is_said() -> None:
 
 def test_the_changelog_is_short() -> None:
     assert len((ROOT / "CHANGELOG.md").read_text(encoding="utf-8").splitlines()) <= 80
+
+
+#: Option → the words that it takes, of whichever command shows it.
+WORDS = {
+    "--for": {"help", "serving"} | {n for p in PROFILES for n in (p.name, *p.aliases)} | {t.name for t in TARGETS},
+    "--to": {*WRITTEN},
+}
+
+
+@pytest.mark.parametrize("page", pages(), ids=name_of)
+@pytest.mark.parametrize("option", WORDS)
+def test_every_word_of_an_option_is_one_that_it_takes(page: Path, option: str) -> None:
+    """In code spans and in the blocks."""
+    text = " ; ".join(re.findall(r"```.*?```|`[^`]+`", page.read_text(encoding="utf-8"), re.DOTALL))
+    said = {word for found in re.findall(rf"{option}[ =]([a-z][\w.,-]*\w)", text) for word in found.split(",")}
+    new = {"steps"} if name_of(page) == "docs/extending.md" else set()  # what that page adds
+    assert said - new <= WORDS[option] | {t.name for t in TARGETS if option == "--for"}
+
+
+def test_what_is_said_not_to_be_done_is_not() -> None:
+    text = prose(ROOT / "docs" / "comparison.md").partition("## What this project does not do")[2]
+    for claim in ("Prune, retrain, or quantise activations", "Write Core ML or TensorRT", "Run Unity"):
+        assert claim in text, claim
+    assert not {k for k in WRITTEN if re.search("coreml|mlmodel|tensorrt|engine", k)}
+    assert not {o for o in options() if re.search("prune|retrain|activations", o)}
+    assert "Anything beyond the op table is refused by name" in text
+
+
+def test_the_loaders_that_robots_md_names_are_held_to_what_it_says() -> None:
+    text = prose(ROOT / "docs" / "robots.md")
+    assert "opset 11" in text and profile("isaac-lab").opset == 11
+    for name in (n for p in PROFILES if p.loaders for n in (p.name,)):
+        assert f"| `{name}` |" in text
+
+
+def test_the_files_and_the_help_are_as_short_as_is_said() -> None:
+    """A page of one file weighs about what is said (tests/serve holds it below 200 kB), the help twelve options."""
+    said = {
+        int(n)
+        for page in ("docs/web.md", "docs/serve.md")
+        for n in re.findall(r"one file, (\d+) kB", prose(ROOT / page))
+    }
+    assert said and max(said) <= 200
+    shown = export_model("--help").out.splitlines()
+    assert len(shown) <= 30 and max(map(len, shown)) <= 80
+    assert "twelve options" in prose(ROOT / "docs" / "start.md")
+    assert len({o for line in shown for o in re.findall(r"^  (?:-\w, )?(--[a-z-]+|-[vq])", line)}) in (11, 12, 13)
