@@ -18,9 +18,8 @@ import numpy as np
 import numpy.typing as npt
 
 from converters.formats.bundle.bundle import Bundle
-from exporter.serve.gallery import PREVIEWS
 from exporter.serve.scenes import scene_of
-from exporter.serve.site import assemble_one_file
+from exporter.serve.site import PREVIEWS, assemble_one_file
 from fixtures.trained import run_folder
 from tests.commands import export_model
 from tests.serve.browsing import visit

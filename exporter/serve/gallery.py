@@ -16,11 +16,10 @@ from converters.formats.bundle.bundle import Bundle, dumps
 from exporter import __version__
 from exporter.serve.scenes import other_side, scene_of
 from exporter.serve.server import INDEX
-from exporter.serve.site import MADE_BY, PAGE, SITE, assemble, assemble_one_file
+from exporter.serve.site import MADE_BY, PAGE, SITE, assemble, assemble_one_file, preview
 from exporter.tables import count_text
 from signatures.errors import BundleError, ExportModelError
 
-PREVIEWS = Path(__file__).resolve().parent / "previews"
 STYLE = "gallery.css"
 _CSS = """\
 :root { color-scheme: light dark; --paper: #fff; --sheet: #f4f6f8; --ink: #16191d; --soft: #5a626c; --accent: #2f5fb3; }
@@ -123,8 +122,7 @@ def _picture(folder: Path) -> Path | None:
     """The picture of a policy's environment; None where it has none."""
     found = Bundle.open(folder)
     scene = scene_of(found.name, found.signature)
-    picture = None if scene is None else PREVIEWS / f"{scene.id}.png"
-    return picture if picture is not None and picture.is_file() else None
+    return preview(None if scene is None else scene.id)
 
 
 def _card(folder: Path, address: str, picture: Path | None) -> str:

@@ -28,6 +28,9 @@ from signatures.contract import PARITY, POLICY
 from signatures.errors import BundleError, RuntimeUnavailableError, naming
 
 PAGE = Path(__file__).resolve().parent / "page"
+#: Stills of the environments, of ``make pictures``.
+PREVIEWS = PAGE.parent / "previews"
+_PREVIEW = "preview.png"
 POLICY_MODULE = Path(converters.formats.tfjs.__file__).resolve().parent / "js" / "policy.mjs"
 #: All drawings; a page has that of its scene.
 _VIEWS = "views/index.mjs"
@@ -96,7 +99,22 @@ def assemble(folder: Path, scene: str = AUTO) -> dict[str, bytes]:
     site.update(vendor)
     site[SITE] = dumps({**said, "backends": [_JS, *backends], "absent": absent})
     site[INDEX] = _asking_at_once(site)
+    picture = preview(said["scene"])
+    if picture is not None:
+        site[_PREVIEW] = picture.read_bytes()
+        site[INDEX] = _with_picture(site[INDEX], _PREVIEW)
     return site
+
+
+def preview(scene: str | None) -> Path | None:
+    """The picture of an environment that messengers show with a link; None where there is none."""
+    picture = None if scene is None else PREVIEWS / f"{scene}.png"
+    return picture if picture is not None and picture.is_file() else None
+
+
+def _with_picture(page: bytes, address: str) -> bytes:
+    """Return index.html with the picture's address, relative to the page's own."""
+    return page.replace(b"</head>", f'<meta property="og:image" content="{html.escape(address)}">\n</head>'.encode(), 1)
 
 
 def assemble_one_file(folder: Path, scene: str = AUTO, *, picture: str | None = None) -> bytes:
@@ -113,8 +131,7 @@ def assemble_one_file(folder: Path, scene: str = AUTO, *, picture: str | None = 
     absent = [{"name": "TensorFlow.js", "why": "a page of one file runs on its own kernels alone"}]
     site[SITE] = dumps({**said, "tfjs": None, "backends": [_JS], "absent": absent})
     if picture is not None:
-        tag = f'<meta property="og:image" content="{html.escape(picture)}">\n</head>'
-        site[INDEX] = site[INDEX].replace(b"</head>", tag.encode(), 1)
+        site[INDEX] = _with_picture(site[INDEX], picture)
     with naming(folder):
         return one_file(site)
 

@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from exporter.serve.gallery import PREVIEWS, assemble_gallery
+from exporter.serve.gallery import assemble_gallery
 from exporter.serve.scenes import SCENES
-from exporter.serve.site import PAGE, assemble, assemble_one_file, describe_page
+from exporter.serve.site import PAGE, PREVIEWS, assemble, assemble_one_file, describe_page
 from signatures.errors import BundleError
 from tests.commands import export_model, files_in, is_refused
 from tests.serve.browsing import CHECKED, served, visit
@@ -68,6 +68,12 @@ def test_a_page_says_what_messengers_show_of_a_link(bundle: Bundle, name: str) -
         (described,) = re.findall(r'<meta name="description" content="([^"]+)">', text)
         assert f'<meta property="og:description" content="{described}">' in text
         assert ("untrained" in described) == (name == "3DBall")
+    site = assemble(bundle(name))
+    assert (
+        ("preview.png" in site)
+        == (b'property="og:image" content="preview.png"' in site["index.html"])
+        == (name == "3DBall")
+    )
 
 
 @given(st.text(), st.booleans())
