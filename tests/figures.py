@@ -6,6 +6,7 @@ says nothing that depends on the machine's place or speed.
 ``python -m tests.figures --profiles`` counts what each profile of ``--for`` holds and refuses, and runs what is held
 (tests/targets/sweep.py, 35 minutes of a processor),
 ``python -m tests.figures --litert`` counts what is written as .tflite, and runs it (tests/litert/sweep.py, 15 minutes),
+``python -m tests.figures --programs`` the same of source code in C, C# and JavaScript (tests/programs/sweep.py),
 ``python -m tests.figures --page`` writes the page anew from the figures that are there.
 """
 
@@ -246,6 +247,7 @@ def page(content: Mapping[str, Any]) -> str:
         *_table(["runtime", "version"], [[r, v] for r, v in content["runtimes"].items()]),
         *(_profiles(content["unity"]) if "unity" in content else []),
         *(_litert(content["litert"]) if "litert" in content else []),
+        *(_programs(content["programs"]) if "programs" in content else []),
     ]
     return "\n".join(lines).rstrip() + "\n"
 
@@ -303,6 +305,30 @@ def _litert(counted: Mapping[str, Any]) -> list[str]:
     ]
 
 
+def _programs(counted: Mapping[str, Any]) -> list[str]:
+    """The section on source code."""
+    rows = counted["keys"]
+    refused = "; ".join(f"{key}: {what}: {n}" for key, c in rows.items() for what, n in c["refused"].items())
+    return [
+        "## Source code",
+        "",
+        f"Counted on {counted['date']} by `python -m tests.figures --programs`, on the same {counted['files']} files: "
+        f"{counted['onnx']} policies that are written as ONNX, {counted['memory']} with a memory. *Agree*: decisions, "
+        "masks, memory over steps, and draws by distribution.",
+        "",
+        *_table(
+            ["`--to`", "compiled and run by", "written", "agree", "with draws", "the original ran beside it"],
+            [
+                [f"`{key}`", counted["judges"][key], c["written"], c["agree"], c["draws"], c["original"]]
+                for key, c in rows.items()
+            ],
+        ),
+        f"Refused: {refused or 'none'}. "
+        f"Not in agreement: {', '.join(f for c in rows.values() for f in c['failed']) or 'none'}.",
+        "",
+    ]
+
+
 def _spread(found: Sequence[Mapping[str, Any]]) -> list[object]:
     counts: dict[float, int] = defaultdict(int)
     for cell in found:
@@ -322,6 +348,7 @@ def main() -> int:
     parser.add_argument("--page", action="store_true", help="only the page, from the figures that are there")
     parser.add_argument("--profiles", action="store_true", help="only what each profile of --for holds")
     parser.add_argument("--litert", action="store_true", help="only what is written as .tflite")
+    parser.add_argument("--programs", action="store_true", help="only what is written as source code")
     options = parser.parse_args()
     before = json.loads(FIGURES.read_text(encoding="utf-8")) if FIGURES.is_file() else {}
     if options.profiles:
@@ -337,6 +364,13 @@ def main() -> int:
         with RuntimePool() as pool:
             found = {"date": _today(), **litert.sweep(known.sources(), pool)}
         FIGURES.write_text(json.dumps({**before, "litert": found}, indent=1) + "\n", encoding="utf-8")
+    elif options.programs:
+        from tests import known
+        from tests.programs import sweep as programs
+
+        with RuntimePool() as pool:
+            found = {"date": _today(), **programs.sweep(known.sources(), pool)}
+        FIGURES.write_text(json.dumps({**before, "programs": found}, indent=1) + "\n", encoding="utf-8")
     elif not options.page:
         files = [(origin, f) for origin, f in sources() if options.only in str(f)]
         if not files or not SHARED.is_dir():
@@ -347,7 +381,7 @@ def main() -> int:
         if options.only:
             print(page(content))
             return 1 if content["failed"] else 0
-        kept = {key: before[key] for key in ("unity", "litert") if key in before}
+        kept = {key: before[key] for key in ("unity", "litert", "programs") if key in before}
         FIGURES.write_text(json.dumps({**content, **kept}, indent=1) + "\n", encoding="utf-8")
     content = json.loads(FIGURES.read_text(encoding="utf-8"))
     PAGE.write_text(page(content), encoding="utf-8")

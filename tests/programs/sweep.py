@@ -23,6 +23,8 @@ from signatures.errors import ExportModelError
 from tests import known
 
 KEYS = tuple(f.key for f in WRITTEN.values() if f.program)
+#: Who compiles and runs each.
+JUDGES = {"c": "gcc", "csharp": "mono", "js": "Node"}
 LINES = Path(__file__).resolve().parents[2] / "build" / "programs.jsonl"
 #: What runs sources themselves, so that a program is held against more than our own reading.
 ORIGINALS = ("tensorflow", "onnxruntime")
@@ -107,7 +109,7 @@ def count(records: Iterable[dict[str, Any]], keys: Sequence[str]) -> dict[str, A
 
 def sweep(files: Sequence[Path], pool: RuntimePool) -> dict[str, Any]:
     """The counts of all files in all languages."""
-    return count(lines(files, KEYS, pool, LINES), KEYS)
+    return {"judges": JUDGES, **count(lines(files, KEYS, pool, LINES), KEYS)}
 
 
 def main() -> None:
