@@ -87,6 +87,7 @@ def export(
         weights=storage(write.dtype, write.quantize),
         batch=write.batch,
         code=code_options(write.math, write.weights, write.outputs, write.guard),
+        bake=write.bake,
     )
     live = {"session": session, "tf_function": tf_function, "keras_model": keras_model}
     with _sources(source, live, read.step) as sources:

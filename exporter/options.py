@@ -36,6 +36,8 @@ class ReadOptions(Struct, frozen=True, kw_only=True):
     #: File with the statistics that a model of Stable-Baselines3 was trained behind (default: the one next to it), or
     #: ``"none"`` to leave them out.
     normaliser: Path | str | None = None
+    #: File that states the interface (default: those next to the source), or ``"none"`` to leave it out.
+    interface: Path | str | None = None
     #: Let Keras load what is not plain data. It can run code.
     trust_source: bool = False
 
@@ -43,7 +45,10 @@ class ReadOptions(Struct, frozen=True, kw_only=True):
         """Return what a format's reader needs of them."""
         sensors = tuple(tuple(shape) for shape in self.sensors)
         normaliser = None if self.normaliser is None else str(self.normaliser)
-        return source.ReadOptions(self.step, sensors, self.trust_source, tuple(self.goals), self.activation, normaliser)
+        interface = None if self.interface is None else str(self.interface)
+        return source.ReadOptions(
+            self.step, sensors, self.trust_source, tuple(self.goals), self.activation, normaliser, interface
+        )
 
 
 class WriteOptions(Struct, frozen=True, kw_only=True):
@@ -69,6 +74,8 @@ class WriteOptions(Struct, frozen=True, kw_only=True):
     weights: str = "source"
     outputs: str = "actor"
     guard: float | None = None
+    #: ``"actions"``: the graph computes what is stated of the action, its scale, offset and clip.
+    bake: str | None = None
     #: Names of observations and actions: a file or a mapping.
     labels: Labels | None = None
 

@@ -20,6 +20,7 @@ from msgspec import Struct, field
 from signatures.bounded import loads
 from signatures.code import CHOICES
 from signatures.fields import Field, FieldError, without_none
+from signatures.interface import parse_interface
 from signatures.labels import parse_labels
 from signatures.memories import SourcePart
 from signatures.roles import INPUT_ROLES, Constant, Role
@@ -171,6 +172,7 @@ def parse(content: Any) -> Contract:
         weights=None if tool["weights"].missing else tool["weights"].one_of(("float16", "int8")),
         batch=None if tool["batch"].missing else tool["batch"].integer(1),
         code=None if tool["code"].missing else _code(tool["code"]),
+        bake=None if tool["bake"].missing else tool["bake"].one_of(("actions",)),
     )
     return Contract(name.value, signature, origin, parse_source_map(source, signature), made, files)
 
@@ -214,6 +216,7 @@ def parse_signature(whole: Field) -> PolicySignature:
         constants={name: _constant(value) for name, value in whole["constants"].members().items()},
         notes=tuple(note.text() for note in whole["notes"].items()),
         labels=labels,
+        interface=parse_interface(whole["interface"], list(named)),
     )
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from msgspec import Struct, field
 
+from signatures.interface import Interface
 from signatures.memories import SourcePart
 from signatures.roles import OBSERVATIONS, Constant, Role
 
@@ -127,6 +128,8 @@ class PolicySignature(Struct, frozen=True):
     notes: tuple[str, ...] = ()
     #: Names that people gave to observations and actions (signatures/labels.py); empty where they gave none.
     labels: Mapping[str, Any] = field(default_factory=dict)
+    #: What sources state of units, scales and the control loop; None where none states anything.
+    interface: Interface | None = None
 
     def __repr__(self) -> str:
         return f"<PolicySignature {self.flow}: {self.family}, {self.action_space} actions>"
@@ -213,6 +216,7 @@ class PolicySignature(Struct, frozen=True):
             "constants": dict(self.constants),
             "notes": list(self.notes),
             **({"labels": dict(self.labels)} if self.labels else {}),
+            **({"interface": self.interface.to_dict()} if self.interface else {}),
         }
 
 

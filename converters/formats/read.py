@@ -15,6 +15,8 @@ from converters.formats.format import Format, Member, Ports
 from converters.formats.recognise import not_readable, recognise_path
 from converters.formats.registry import FORMATS
 from converters.formats.source import ReadOptions, SourceModel
+from converters.interfaces.merge import merge
+from converters.interfaces.registry import NO_INTERFACE, read_beside
 from signatures.contract import POLICY
 from signatures.errors import BundleError, ExportModelError, RefusedError, SourceError, UsageError, naming
 
@@ -61,7 +63,7 @@ def read_models(
 
     with np.errstate(all="ignore"):  # weights may be any numbers
         if found.read is not None:
-            return found.read(given, options)
+            return [_with_interface(model, given.path, options) for model in found.read(given, options)]
         members = [_artefact(given.path)] if found.members is None else found.members(given.path, options)
         inside = replace(options, step=None)
         if refused is None or len(members) < 2:
@@ -120,7 +122,23 @@ def _of_member(member: Member, folder: Fetched, options: ReadOptions) -> list[So
         models = found.read(given, options)
     except ExportModelError as error:
         raise (error.at(str(where)) if member.path.is_file() else error) from error.__cause__
-    return [_name_member(model, member) for model in models]
+    return [_with_interface(_name_member(model, member), member.path, options) for model in models]
+
+
+def _with_interface(model: SourceModel, path: Path, options: ReadOptions) -> SourceModel:
+    """The model with what the files beside it state of its numbers; an artefact of ours says all by itself."""
+    if model.facts.ours and options.interface is None:
+        return model
+    own = model.facts.interface
+    stated, notes = read_beside(path, model.name, options.interface)
+    if stated is None and not notes:
+        left_out = options.interface == NO_INTERFACE
+        return replace(model, facts=replace(model.facts, interface=None)) if left_out else model
+    if own is not None and stated is not None:
+        stated, conflicts = merge(own, stated)
+        notes = (*notes, *conflicts)
+    facts = replace(model.facts, interface=stated or own, notes=(*model.facts.notes, *notes))
+    return replace(model, facts=facts)
 
 
 def _name_member(model: SourceModel, member: Member) -> SourceModel:

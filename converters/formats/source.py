@@ -84,7 +84,7 @@ class ReadOptions(Struct, frozen=True):
     order, lists of entities [most, numbers], images C, H, W (empty: as far as the source tells); whether a source may
     be loaded that runs what it says; which of the sensors are goals, by their place; the activation between layers; the
     file with the statistics that observations were normalised by (None: the one beside the source; ``NO_NORMALISER``:
-    they are left out).
+    they are left out); the file that states the interface (None: those beside the source; "none": none).
     """
 
     step: int | None = None
@@ -93,3 +93,4 @@ class ReadOptions(Struct, frozen=True):
     goals: tuple[int, ...] = ()
     activation: str | None = None
     normaliser: str | None = None
+    interface: str | None = None

@@ -8,6 +8,7 @@ from typing import Any
 from msgspec import Struct, field
 
 from converters.policy.rules import Decision
+from signatures.interface import Interface
 from signatures.memories import SeparateMemory
 from signatures.roles import Constant, Role
 
@@ -31,6 +32,8 @@ class SourceFacts(Struct, frozen=True):
     - ``rows``: the only number of rows that the source takes, or gets right; None: any.
     - ``notes``: what the user should know of this source.
     - ``labels``: names of observations (by placeholder) and actions, where the source carries them.
+    - ``interface``: what the source and the files beside it state of its numbers; observations by placeholder.
+    - ``ours``: the source is an artefact of ours, which says all that is known of it.
     - ``model_name``, ``loss``: what the model is called, and what it was trained with, where the format says it.
     - ``memories``: inputs and outputs of their own that are one memory, in the order in which they are joined; None:
       names and shapes tell.
@@ -49,6 +52,8 @@ class SourceFacts(Struct, frozen=True):
     rows: int | None = None
     notes: tuple[str, ...] = ()
     labels: Mapping[str, Any] = field(default_factory=dict)
+    interface: Interface | None = None
+    ours: bool = False
     model_name: str = ""
     loss: str = ""
     memories: tuple[SeparateMemory, ...] | None = None

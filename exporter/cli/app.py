@@ -7,6 +7,7 @@ import click
 from exporter.cli.group import Rooms, SourceGroup, help_all_option, show_version
 
 _COMMANDS = (
+    "card",
     "compare",
     "completion",
     "consumers",

@@ -20,6 +20,7 @@ from exporter.cli.options import (
     located,
     normalising,
     read_options,
+    stating,
     trusting,
     understanding,
 )
@@ -72,6 +73,7 @@ if TYPE_CHECKING:
 @click.option("--sensors", metavar="SHAPE,...", help="What the agent of a .pt observes: 8,20x4,3x84x84.")
 @activating
 @normalising
+@stating
 @click.option(
     "--dtype",
     type=click.Choice(["float32", "float16"]),
@@ -81,6 +83,7 @@ if TYPE_CHECKING:
 @click.option("--quantize", type=click.Choice(["int8"]), help="Store each weight in one byte.")
 @coding
 @click.option("--batch", type=int, metavar="N", help="Write files for N agents at a time (ONNX, LiteRT).")
+@click.option("--bake", type=click.Choice(["actions"]), help="Put the action's scale and offset into the graph.")
 @click.option("--labels", type=PATH, metavar="FILE", help="Names of observations and actions.")
 @click.option("--opset", type=int, metavar="N", help="ONNX opset (default: 15).")
 @located
@@ -104,12 +107,14 @@ def export_command(
     sensors: str | None,
     activation: str | None,
     normaliser: Path | str | None,
+    interface: Path | None,
     trust_source: bool,
     labels: Path | None,
     dtype: str,
     quantize: str | None,
     batch: int | None,
     code: CodeOptions,
+    bake: str | None,
     env: str | None,
     jobs: int | None,
     cluster: str | None,
@@ -134,7 +139,7 @@ def export_command(
         targets=None if targets is None else [t for t in targets.split(",") if t],
         name=name,
         compile=compiling,
-        read=read_options(step, sensors, trust_source, activation, normaliser),
+        read=read_options(step, sensors, trust_source, activation, normaliser, interface),
         opset=opset,
         verify=runtimes,
         parity=options,
@@ -143,10 +148,11 @@ def export_command(
         weights=storage(dtype, quantize),
         batch=batch,
         code=code,
+        bake=bake,
     )
     many = again or fail_fast or jobs is not None or cluster is not None or _are_many(sources, out)
     if env is not None:
-        _check_playable(env, 2 if many else len(sources), runtimes, profile)
+        _check_playable(env, 2 if many else len(sources), runtimes, profile, bake)
     if many:
         from exporter.cli.fleet import run_fleet
 
@@ -207,7 +213,7 @@ def _export_all(
     return results, refused
 
 
-def _check_playable(env: str, sources: int, runtimes: str, profile: str | None) -> None:
+def _check_playable(env: str, sources: int, runtimes: str, profile: str | None, bake: str | None) -> None:
     """Raise UsageError where what is exported cannot play, before anything takes long."""
     from exporter.play.named import world_maker
     from signatures.errors import UsageError
@@ -219,6 +225,10 @@ def _check_playable(env: str, sources: int, runtimes: str, profile: str | None) 
             f"--env does not go with --for {profile}",
             why="files with a consumer's names lack outputs that a reading of them has",
             fix="export without --for to play; --for is held against the source by its numbers",
+        )
+    if bake is not None:
+        raise UsageError(
+            "--env does not go with --bake", why="the source acts in other numbers", fix="leave one of them out"
         )
     if runtimes == "none":
         raise UsageError("--env needs runtimes", why="--verify none was given", fix="leave one of them out")

@@ -24,18 +24,31 @@ PROGRAM = "export-model"
 PATH, FILE = click.Path(path_type=Path), click.Path(path_type=Path, dir_okay=False)
 _OWN = frozenset(("--help", "-h", "--help-all", "--version"))
 #: Commands that ``--help`` leaves to ``--help-all``.
-_RARE = frozenset(("completion", "consumers"))
+_RARE = frozenset(("card", "completion", "consumers"))
 
 
 #: Title of a group of options → their parameters, in the order of the help.
 GROUPS = {
     "What to write": (
         *("out", "targets", "profile", "name", "names", "noise", "deterministic", "labels", "opset", "logdir", "svg"),
-        *("dtype", "quantize", "batch", "math", "weights", "outputs_of", "guard", "scene", "target", "files"),
+        *(
+            "dtype",
+            "quantize",
+            "batch",
+            "bake",
+            "play",
+            "math",
+            "weights",
+            "outputs_of",
+            "guard",
+            "scene",
+            "target",
+            "files",
+        ),
     ),
     "How to read the source": (
         *("source", "step", "brain", "inputs", "outputs", "values", "mapped", "sensors", "activation"),
-        *("normaliser", "trust_source"),
+        *("normaliser", "interface", "trust_source"),
     ),
     "What Unity would say": ("releases", "actions", "brain_parameters"),
     "How to play": ("env", "episodes", "most", "likeliest", "margin", "strict", "partner"),

@@ -11,7 +11,7 @@ import click
 
 from exporter.cli.export import export_command
 from exporter.cli.group import FILE, PATH, command
-from exporter.cli.options import activating, as_given, normalising, read_options, trusting, understanding
+from exporter.cli.options import activating, as_given, normalising, read_options, stating, trusting, understanding
 from exporter.cli.terminal import say, say_json, say_lines
 from signatures.errors import ExportModelError, UsageError
 
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 @click.option("--sensors", metavar="SHAPE,...", help="What the agent (of a .pt) observes: 8,20x4,3x84x84.")
 @activating
 @normalising
+@stating
 @click.option(
     "--unity",
     "releases",
@@ -59,6 +60,7 @@ def inspect_command(
     sensors: str | None,
     activation: str | None,
     normaliser: Path | str | None,
+    interface: Path | None,
     releases: tuple[str, ...],
     actions: str | None,
     brain_parameters: Path | None,
@@ -89,6 +91,7 @@ def inspect_command(
                 "--step": step is not None,
                 "--activation": activation is not None,
                 "--normaliser": normaliser is not None,
+                "--interface": interface is not None,
                 "--trust-source": trust_source,
                 "--brain, --input, --output or --set": compiling != CompileOptions(),
             }
@@ -102,7 +105,7 @@ def inspect_command(
                     found.append(report)
                     status = max(status, verdict)
                 else:
-                    read = read_options(step, sensors, trust_source, activation, normaliser)
+                    read = read_options(step, sensors, trust_source, activation, normaliser, interface)
                     found.append(_inspect_source(here, compiling, read, logdir, svg, as_json=as_json, why=why))
                     status = 2 if "refused" in found[-1] else status
         except ExportModelError as error:

@@ -68,7 +68,18 @@ def as_given(names: Container[str]) -> list[str]:
 #: What decides how a policy is read and judged. A report that says how to compare again has these as they were given.
 JUDGING = frozenset(
     (
-        *("mapped", "brain", "inputs", "outputs", "values", "normaliser", "trust_source", "source", "step"),
+        *(
+            "mapped",
+            "brain",
+            "inputs",
+            "outputs",
+            "values",
+            "normaliser",
+            "interface",
+            "trust_source",
+            "source",
+            "step",
+        ),
         *("golden", "sizes", "tolerances", "atol", "rtol", "required"),
     )
 )
@@ -93,13 +104,19 @@ def sensors_of(text: str | None) -> tuple[tuple[tuple[int, ...], ...], tuple[int
 
 
 def read_options(
-    step: int | None, sensors: str | None, trust_source: bool, activation: str | None, normaliser: Path | str | None
+    step: int | None,
+    sensors: str | None,
+    trust_source: bool,
+    activation: str | None,
+    normaliser: Path | str | None,
+    interface: Path | None = None,
 ) -> ReadOptions:
     """What a reader is told, of the command line's words. Raises UsageError."""
     from converters.formats.source import ReadOptions
 
     shapes, goals = sensors_of(sensors)
-    return ReadOptions(step, shapes, trust_source, goals, activation, None if normaliser is None else str(normaliser))
+    files = [None if file is None else str(file) for file in (normaliser, interface)]
+    return ReadOptions(step, shapes, trust_source, goals, activation, *files)
 
 
 #: Where files are run; a word means the same in every command.
@@ -118,6 +135,10 @@ activating = click.option(
 #: For policies that were trained behind a normaliser of their own.
 normalising = click.option(
     "--normaliser", type=FILE, metavar="FILE", help="Statistics of a .zip: vecnormalize.pkl, if not next to it."
+)
+#: For policies whose numbers are explained elsewhere than beside them.
+stating = click.option(
+    "--interface", type=FILE, metavar="FILE", help="YAML that states the interface (default: beside), or none."
 )
 #: For sources that only a loader of their own can read, which runs what they say.
 trusting = click.option("--trust-source", is_flag=True, help="Let Keras load what is not plain data; can run code.")

@@ -19,11 +19,12 @@ from converters.formats.registry import FROZEN_GRAPH, WRITTEN
 from converters.formats.saved_model.writer import signatures_of
 from converters.formats.source import NO_NORMALISER, OriginalRun, ReadOptions
 from converters.graph.nodes import Graph, Node, TensorShape
+from converters.interfaces.isaac_lab import RAW_ACTION
 from converters.policy.policy import Policy
 from converters.runtimes.pool import RuntimePool, chosen_runtimes
-from exporter.export.job import Job, own_in, runs_elsewhere
+from exporter.export.job import Job, bake, own_in, runs_elsewhere
 from exporter.export.options import storage_of
-from exporter.export.pipeline import Progress, consumer, join_reports
+from exporter.export.pipeline import BEFORE_BAKE, UNDER_OWN_NAMES, Progress, consumer, join_reports
 from exporter.export.sources import Source, read_source
 from exporter.verify.checks.decisions import decisions
 from exporter.verify.options import VerifyOptions
@@ -34,6 +35,7 @@ from signatures.code import CodeOptions
 from signatures.contract import POLICY, Contract, safe_name
 from signatures.errors import BundleError, RuntimeUnavailableError, UsageError, naming
 from signatures.fields import printable
+from signatures.interface import Quantity
 from signatures.roles import Role
 from signatures.spec import PolicySignature
 
@@ -157,6 +159,8 @@ def _unless_unverified(report: ParityReport, case: _Case, *, required: bool) -> 
 def _evidence_of(found: Bundle, read: Source) -> _Given:
     """What the source says of a bundle. Raises BundleError where it is another, or means something else."""
     contract, made_for = found.contract, found.contract.tool.get("profile")
+    if contract.tool.get("bake") is not None:
+        return _Given(read, again=_baked_again(read, contract))
     if made_for is None:
         original = _original_of(read, contract)
         _check_meaning(read, contract, found.folder)
@@ -236,7 +240,8 @@ def _run(
             report = replace(report.with_findings(decided), self_consistent=False, original=ran)
         if again is not None and again.own is not None:
             under = own_in(again, case.formats, scratch / "own")
-            report = join_reports(report, verify(under, running, known, pool, None, progress))
+            other = verify(under, running, known, pool, None, progress)
+            report = join_reports(report, other, BEFORE_BAKE if again.bake else UNDER_OWN_NAMES)
     return report
 
 
@@ -370,6 +375,31 @@ def _made_again(found: Source, contract: Contract, wanted: Profile) -> Job:
         dressed = wanted.dress(own)
         if _tensors(dressed.signature) == _tensors(contract.signature):
             return Job(found, model, replace(dressed, name=contract.name), wanted, own)
+    raise BundleError(
+        "cannot be held against its source",
+        where=str(found.path),
+        why="the source gives other inputs and outputs than the bundle has: it was exported with options",
+        fix="leave --source out, or export it again",
+    )
+
+
+def _baked_again(found: Source, contract: Contract) -> Job:
+    """A bundle's policy from its source, its action baked anew by the bundle's interface.
+
+    Raises BundleError where none is like it. What a file beside the source stated is in the contract.
+    """
+    interface = contract.signature.interface
+    if interface is not None:
+        raw = tuple(Quantity(t.name, t.source, clip=t.clip) for t in interface.baked if t.name == RAW_ACTION)
+        by_name = {t.name: t for t in interface.baked}
+        actions = tuple(by_name.get(t.name, t) for t in interface.actions)
+        interface = replace(interface, baked=(), actions=actions, limits=(*raw, *interface.limits))
+    compiled = list(found.compile_models())
+    named = [(m, p) for m, p in compiled if safe_name(p.name) == contract.name]
+    for model, own in named or compiled[: len(compiled) == 1]:
+        if _tensors(own.signature) == _tensors(contract.signature):
+            policy = replace(own, name=contract.name, signature=replace(own.signature, interface=interface))
+            return bake(Job(found, model, policy), contract.tool["bake"])
     raise BundleError(
         "cannot be held against its source",
         where=str(found.path),

@@ -52,6 +52,8 @@ class Job(Struct, frozen=True):
     batch: int | None = None
     #: how its source code is written
     code: CodeOptions = CodeOptions()
+    #: what of the interface the graph computes beside what its source does
+    bake: str | None = None
 
 
 def artefacts_of(
@@ -68,6 +70,7 @@ def artefacts_of(
             None if job.whole is None else options.weights,
             job.batch,
             options.code,
+            job.bake,
         )
         if job.profile is None:
             how = WriteOptions(
@@ -121,6 +124,7 @@ def contract_of(
     weights: str | None = None,
     batch: int | None = None,
     code: CodeOptions | None = None,
+    bake: str | None = None,
 ) -> Contract:
     """The contract as every artefact embeds it. Raises SignatureError where it could not be read back."""
     origin = Origin(
@@ -134,9 +138,8 @@ def contract_of(
         normaliser=None if read.normaliser is None else printable(Path(read.normaliser).name),
     )
     said = None if code is None else code.to_dict() or None
-    tool = without_none(
-        name="export-model", version=__version__, profile=profile, weights=weights, batch=batch, code=said
-    )
+    made = without_none(profile=profile, weights=weights, batch=batch, code=said, bake=bake)
+    tool = {"name": "export-model", "version": __version__, **made}
     contract = Contract(policy.name, policy.signature, origin, policy.source, tool)
     try:
         parse(contract.to_dict())
@@ -179,7 +182,7 @@ def own_in(job: Job, formats: Sequence[Format], folder: Path) -> PolicyUnderTest
     It is written in those of the formats that hold every policy; one of a consumer alone holds its names and no others.
     """
     assert job.own is not None
-    job = replace(job, policy=job.own, own=None, profile=None, batch=None)
+    job = replace(job, policy=job.own, own=None, profile=None, batch=None, bake=None)
     contract = contract_of(job.policy, job.source, job.model, ReadOptions())
     artifacts = [f.artifact(job.policy, WriteOptions(contract.compact())) for f in formats if f.default]
     for artifact in artifacts:
@@ -238,6 +241,27 @@ def check_code(options: ExportOptions, formats: Sequence[Format]) -> None:
             why="it says how source code is written",
             fix=f"add a format to --to: {', '.join(f.key for f in WRITTEN.values() if f.program)}",
         )
+
+
+def check_bake(options: ExportOptions) -> None:
+    """Raise UsageError where an interface is to be baked and a consumer decides what its action is."""
+    if options.bake is not None and options.profile is not None:
+        raise UsageError(
+            f"--bake {options.bake} does not go with --for {options.profile}",
+            why="the consumer's agents apply their own scale to the action",
+            fix="leave one of them out",
+        )
+
+
+def bake(job: Job, what: str) -> Job:
+    """The policy whose graph computes what is stated of its action; its own is compared with the source."""
+    from converters.compiler.passes.bake import BAKED
+
+    with naming(job.source.path):
+        baked = BAKED[what](job.policy)
+    if baked.graph is job.policy.graph:
+        return replace(job, policy=baked)
+    return replace(job, policy=baked, own=job.policy, bake=what)
 
 
 def fix_batch(job: Job, batch: int, formats: Sequence[Format], flag: str = "--batch") -> Job:

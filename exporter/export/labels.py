@@ -8,11 +8,19 @@ from typing import Any
 
 from msgspec.structs import replace
 
+from converters.interfaces.fit import fit_interface, name_numbers
+from converters.interfaces.merge import merge
 from converters.policy.policy import Policy
 from exporter.options_file import read_options
 from signatures.errors import UsageError
+from signatures.fields import Field, FieldError
+from signatures.interface import parse_interface
 from signatures.labels import validate_labels
+from signatures.spec import PolicySignature
 
+_INTERFACE = "interface"
+#: Tables within tables of an interface.
+_DEEPEST = 4
 Labels = Path | str | Mapping[str, Any]
 
 
@@ -32,7 +40,7 @@ def read_labels(given: Labels | None) -> Mapping[str, Any] | None:
     return content
 
 
-def with_labels(policy: Policy, labels: Mapping[str, Any] | None) -> Policy:
+def with_labels(policy: Policy, labels: Mapping[str, Any] | None, source: str = "--labels") -> Policy:
     """The policy with ``labels`` in its contract; without any, as it is.
 
     Labels of several policies stand under ``policies``, by name; else they must fit every one. Raises UsageError.
@@ -44,7 +52,38 @@ def with_labels(policy: Policy, labels: Mapping[str, Any] | None) -> Policy:
         labels = named.get(policy.name)
     if labels is None:
         return policy
+    labels, stated = {k: v for k, v in labels.items() if k != _INTERFACE}, labels.get(_INTERFACE)
+    if stated is not None:
+        policy = replace(policy, signature=_with_interface(policy.signature, stated, source))
+        if not labels:
+            return policy
     return replace(policy, signature=replace(policy.signature, labels=validate_labels(labels, policy.signature)))
+
+
+def _with_interface(signature: PolicySignature, stated: Any, source: str) -> PolicySignature:
+    """The signature with an interface that a person states, which goes before what files do. Raises UsageError."""
+    try:
+        given = parse_interface(Field(_with_source(stated, source), "interface"), [s.name for s in signature.inputs])
+    except FieldError as error:
+        raise UsageError(f"labels: {error}", fix="write it as policy.json does; see docs/interface.md") from error
+    if given is None:
+        return signature
+    fitted, notes = fit_interface(given, signature, {s.name: s.name for s in signature.inputs})
+    if notes:
+        raise UsageError(f"labels: {notes[0]}", fix="give the size of each term; they are to add up")
+    if fitted is not None and signature.interface is not None:
+        fitted, _ = merge(fitted, signature.interface)
+    return name_numbers(replace(signature, interface=fitted))
+
+
+def _with_source(stated: Any, source: str, depth: int = 0) -> Any:
+    """The same with ``from`` where an entry lacks it: a mapping with a name, a text or seconds."""
+    if isinstance(stated, list):
+        return [_with_source(entry, source, depth) for entry in stated] if depth < _DEEPEST else stated
+    if not isinstance(stated, Mapping) or depth > _DEEPEST:
+        return stated
+    entry = {key: _with_source(value, source, depth + 1) for key, value in stated.items()}
+    return {"from": source, **entry} if {"name", "text", "seconds"} & entry.keys() else entry
 
 
 def check_labels(labels: Mapping[str, Any] | None, policies: Sequence[str]) -> None:

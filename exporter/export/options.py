@@ -39,6 +39,8 @@ class ExportOptions(Struct, frozen=True):
     batch: int | None = None
     #: how source code is written (``--math``, ``--weights``, ``--outputs``, ``--guard``)
     code: CodeOptions = CodeOptions()
+    #: what of the interface the graph computes (``--bake``): ``actions``, or None
+    bake: str | None = None
 
 
 def storage(dtype: str, quantize: str | None) -> Storage:

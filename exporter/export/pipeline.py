@@ -20,6 +20,8 @@ from converters.policy.policy import Policy
 from exporter.export.job import (
     Job,
     artefacts_of,
+    bake,
+    check_bake,
     check_batch,
     check_code,
     check_weights,
@@ -45,6 +47,7 @@ from signatures.errors import (
     RefusedError,
     UsageError,
 )
+from signatures.fields import printable
 
 if TYPE_CHECKING:
     from converters.consumers.profile import Profile
@@ -123,6 +126,7 @@ class Exporter:
         check_weights(options, self._formats)
         check_batch(options, self._formats)
         check_code(options, self._formats)
+        check_bake(options)
         self._profile = wanted
         #: None where the writers of its formats give a policy the consumer's names
         self._dress = None if wanted is None or self._formats[0].key in wanted.own_names else wanted.dress
@@ -135,6 +139,7 @@ class Exporter:
         _check_parity(options, self._formats)
         check_sendable(options.out)
         self._labels = read_labels(options.labels)
+        self._labelled_by = printable(Path(options.labels).name) if isinstance(options.labels, Path | str) else "labels"
 
     def check(self, paths: Sequence[Path | str | Source], progress: Progress) -> None:
         """Raise UsageError where names in ``--labels`` or ``--tolerances`` are nobody's: all sources are compiled ahead
@@ -182,8 +187,9 @@ class Exporter:
         called = names.claim(origin, [safe_name(policy.name) for _, policy in found])
         for (model, policy), (name, note) in zip(found, called, strict=True):
             own = replace(policy, name=name)
-            dressed = with_labels(own if dress is None else dress(own), self._labels)
+            dressed = with_labels(own if dress is None else dress(own), self._labels, self._labelled_by)
             job = Job(source, model, dressed, self._profile, None if dress is None else own, note, code=options.code)
+            job = job if options.bake is None else bake(job, options.bake)
             if options.batch is not None:
                 job = fix_batch(job, options.batch, self._formats)
             elif self._profile is not None and self._profile.batch is not None:
@@ -223,7 +229,8 @@ class Exporter:
                 report = verify(tested, self.runtimes, self._known, pool, options.parity, progress)
                 if job.own is not None:
                     under = own_in(job, self._formats, folder / "own")
-                    report = join_reports(report, verify(under, self.runtimes, self._known, pool, rules, progress))
+                    other = verify(under, self.runtimes, self._known, pool, rules, progress)
+                    report = join_reports(report, other, BEFORE_BAKE if job.bake else UNDER_OWN_NAMES)
                 if job.whole is not None:
                     from exporter.verify.checks.decisions import decisions
 
@@ -361,10 +368,15 @@ def _formats(options: ExportOptions, wanted: Profile | None) -> list[Format]:
     return [format_for_writing(target) for target in targets]
 
 
+#: What a second policy of a report is.
+UNDER_OWN_NAMES = "the policy under its own names, from which this was made"
+BEFORE_BAKE = "the policy before its action was scaled (--bake actions), from which this was made"
+
+
 def join_reports(
     report: ParityReport,
     own: ParityReport,
-    what: str = "the policy under its own names, from which this was made",
+    what: str = UNDER_OWN_NAMES,
 ) -> ParityReport:
     """The report of a policy, with what came of the one that it was made from."""
     said = own.verdict if own.passed is not None else f"{count_text(len(own.comparisons), 'comparison')} passed"

@@ -16,6 +16,7 @@ from converters.formats.format import Format, WriteOptions
 from converters.formats.registry import WRITTEN
 from converters.formats.source import ReadOptions
 from converters.graph.nodes import Graph
+from converters.interfaces.text import kept_text, loop_lines, tables
 from converters.policy.policy import Policy
 from converters.policy.rules import Decision
 from exporter.export.sources import read_source
@@ -214,6 +215,7 @@ def _policy_text(inspected: PolicyInspection) -> str:
         lines.append(paragraph(way, "layers: " if len(inspected.layers) == 1 else f"layers to {name}: ", "  "))
     lines += [paragraph(text, f"{name} is normalised by: ", "  ") for name, text in _normaliser_texts(signature)]
     lines += _label_lines(signature.labels)
+    lines += _interface_lines(signature)
     if signature.constants:
         lines += ["", paragraph(", ".join(f"{k}={v}" for k, v in signature.constants.items()), "constants: ", "  ")]
     lines += [paragraph(note, "note: ", "  ") for note in signature.notes]
@@ -273,6 +275,16 @@ def _label_lines(labels: Mapping[str, Any]) -> list[str]:
     numbered = [(name, ", ".join(f"{i} {text}" for i, text in enumerate(texts))) for name, texts in named]
     lines = [paragraph(text, printable(f"labels of {name}: "), "  ") for name, text in numbered]
     return ["", *lines] if lines else []
+
+
+def _interface_lines(signature: PolicySignature) -> list[str]:
+    """What the source and the files beside it state of the numbers, and the keys that are not understood."""
+    lines = []
+    for name, head, rows in tables(signature):
+        lines += ["", printable(f"interface of {name}:"), table(head, rows)]
+    stated = [paragraph(text, "stated: ", "  ") for text in loop_lines(signature.interface)]
+    kept = kept_text(signature.interface)
+    return [*lines, *([""] if stated else []), *stated, *([paragraph(kept, "kept as text: ", "  ")] if kept else [])]
 
 
 def _feed(spec: TensorSpec, preprocess: Mapping[str, Any]) -> str:

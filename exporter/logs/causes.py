@@ -176,6 +176,36 @@ def _raw(mean: Array, std: Array) -> Callable[[Array], Array]:
     return lambda array: array * std + mean
 
 
+def _stated_scales(signature: PolicySignature, recording: Recording) -> Iterator[Cause]:
+    """Scales that the interface states, applied twice or not at all."""
+    interface = signature.interface
+    for spec, logged in vectors(signature, recording) if interface is not None else ():
+        terms = interface.observations.get(spec.name, ()) if interface is not None else ()
+        widths = [term.width for term in terms]
+        if None in widths or sum(w or 0 for w in widths) != logged.shape[1]:
+            continue
+        first = 0
+        for term, width in zip(terms, widths, strict=True):
+            last = first + (width or 0)
+            scale = np.resize(np.asarray(term.scale or (1.0,), logged.dtype), last - first)
+            where = f"{spec.name}[{first}…{last - 1}]"
+            if (scale != 1).any() and scale.all():
+                twice = f"the scale of {term.name} ({term.source}) was applied twice"
+                yield Cause("stated_scale", where, twice, on(spec.name, _scale_columns(first, last, scale)))
+                missing = f"the scale of {term.name} ({term.source}) was not applied"
+                yield Cause("stated_scale", where, missing, on(spec.name, _scale_columns(first, last, 1 / scale)))
+            first = last
+
+
+def _scale_columns(first: int, last: int, factors: Array) -> Callable[[Array], Array]:
+    def change(array: Array) -> Array:
+        copy = array.copy()
+        copy[:, first:last] *= factors
+        return copy
+
+    return change
+
+
 def _times(factor: float) -> Callable[[Array], Array]:
     return lambda array: array * array.dtype.type(factor)
 
@@ -272,6 +302,7 @@ CAUSES: Mapping[str, Maker] = {
     "mask": _masks,
     "image": _images,
     "normaliser": _normaliser,
+    "stated_scale": _stated_scales,
     "clip": _clips,
     "unit": _units,
     "swap": _swaps,

@@ -23,7 +23,7 @@ def markdown_text(entries: Sequence[Entry]) -> str:
     lines = ["## export-model", ""]
     if len(entries) > 1:
         rows = [[_mark(e.report), code(e.name), e.report.verdict, str(len(e.report.failures))] for e in ordered]
-        lines += [*_table(("", "policy", "verdict", "disagreements"), rows), ""]
+        lines += [*markdown_table(("", "policy", "verdict", "disagreements"), rows), ""]
     for entry in ordered:
         lines += _policy(entry)
     return "\n".join(lines).rstrip() + "\n"
@@ -51,7 +51,7 @@ def _policy(entry: Entry) -> list[str]:
         rows.append(
             [code(pair.format), code(pair.runtime), size, *shown, pair.word if pair.passed else f"**{pair.word}**"]
         )
-    lines += [*_table(head, rows), "", _CELLS, ""]
+    lines += [*markdown_table(head, rows), "", _CELLS, ""]
     tolerances = [
         f"- {code(c.output)} in {code(f'{c.format}/{c.runtime}')}: atol {c.tolerance.atol:g}, "
         f"rtol {c.tolerance.rtol:g}: {text(c.tolerance.reason)}"
@@ -73,7 +73,8 @@ def _collapsible_section(title: str, lines: Sequence[str]) -> list[str]:
     return [f"<details><summary>{title}</summary>", "", *lines, "", "</details>", ""] if lines else []
 
 
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    """Lines of a table; its cells are Markdown."""
     return [f"| {' | '.join(cells)} |" for cells in (head, ["---"] * len(head), *rows)]
 
 

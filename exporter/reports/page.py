@@ -33,6 +33,7 @@ _SECTIONS: tuple[Callable[[Entry], Markup | None], ...] = (
     sections.spread,
     sections.memory,
     sections.policy_graph,
+    sections.interface,
     sections.tensors,
     sections.worst_inputs,
     sections.tolerances,

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from converters.interfaces.text import loop_lines, tables
 from exporter.reports import charts
 from exporter.reports.entry import Entry
 from exporter.reports.layers import blocks_of
@@ -44,6 +45,16 @@ def table(caption: str, head: Sequence[Child], rows: Iterable[Sequence[Child]], 
         "table", el("caption", el("span", caption)), el("thead", el("tr", heads)), el("tbody", body), class_=small
     )
     return el("div", whole, class_="scroll", tabindex=0, role="group", aria_label=caption)
+
+
+def interface(entry: Entry) -> Markup | None:
+    """What the source and the files beside it state of the policy's numbers."""
+    signature = entry.signature
+    if signature is None or signature.interface is None:
+        return None
+    shown = [table(f"Interface of {name}", head, rows) for name, head, rows in tables(signature)]
+    lines = [el("li", line) for line in loop_lines(signature.interface)]
+    return section("Interface", shown, el("ul", lines) if lines else None)
 
 
 def _wide(*content: Child) -> Markup:

@@ -6,6 +6,7 @@ import json
 import math
 import re
 import shlex
+import textwrap
 from collections.abc import Callable
 from pathlib import Path
 from string import Template
@@ -16,6 +17,7 @@ from msgspec.structs import replace
 from converters.formats.bundle import bundle
 from converters.formats.frozen_graph.reader import read_graph
 from converters.formats.registry import FROZEN_GRAPH
+from converters.interfaces.text import ALL, loop_lines, term_lines
 from signatures.contract import Contract
 from signatures.errors import naming
 from signatures.ids import bounds_text
@@ -174,16 +176,25 @@ def meaning(bundle: Bundle, spec: TensorSpec) -> list[str]:
     elif spec.role is Role.VECTOR and len(spec.shape) > 2:
         text = "numbers along several axes (a history, a board)"
     names = signature.labels.get("observations", {}).get(spec.name, [])
-    return wrap_items(f"{spec.name}: {text}", number_names(names))
+    return [*wrap_items(f"{spec.name}: {text}", number_names(names)), *_interface_lines(signature, spec.name)]
 
 
 def action_meaning(bundle: Bundle, head: TensorSpec) -> list[str]:
     """Comment lines on an action."""
     if head.is_continuous:
-        return wrap_items(
-            f"{head.shape[-1]} continuous actions", number_names(bundle.signature.labels.get("actions", []))
-        )
+        names = number_names(bundle.signature.labels.get("actions", []))
+        return [
+            *wrap_items(f"{head.shape[-1]} continuous actions", names),
+            *_interface_lines(bundle.signature, head.name),
+            *(line for text in loop_lines(bundle.signature.interface, ALL) for line in textwrap.wrap(text, WIDTH)),
+        ]
     return branch_lines(bundle)
+
+
+def _interface_lines(signature: PolicySignature, name: str) -> list[str]:
+    """Comment lines on what is stated of a tensor's numbers."""
+    lines = term_lines(signature, name)
+    return [part for line in lines for part in textwrap.wrap(line, WIDTH, subsequent_indent="  ")]
 
 
 def branch_lines(bundle: Bundle) -> list[str]:

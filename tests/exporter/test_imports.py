@@ -127,7 +127,17 @@ def test_no_module_imports_itself_round_a_corner() -> None:
 
 
 #: The rooms of ``converters/``, the lowest first: each may import those before it, lazily too.
-ROOMS_FROM_BELOW = ("files", "graph", "policy", "compiler", "trainers", "formats", "consumers", "runtimes")
+ROOMS_FROM_BELOW = (
+    "files",
+    "interfaces",
+    "graph",
+    "policy",
+    "compiler",
+    "trainers",
+    "formats",
+    "consumers",
+    "runtimes",
+)
 
 
 def room_of(module: str) -> str | None:

@@ -15,6 +15,7 @@ from converters.compiler.passes.outputs import LOG_PROBS
 from converters.graph.nodes import Graph, Node, node_of, split_ref
 from converters.graph.shapes import Types, infer_types
 from converters.graph.types import static_shape
+from converters.interfaces.fit import fit_interface, name_numbers
 from converters.policy.action import ActionMeaning, action_meaning
 from converters.policy.brains import Head
 from converters.policy.generations import generation
@@ -22,6 +23,7 @@ from converters.policy.identifiers import id_distribution
 from converters.policy.memories import memory_layout
 from converters.policy.observations import highest_colour, normaliser
 from signatures.errors import SignatureError
+from signatures.interface import Interface
 from signatures.labels import remaining
 from signatures.roles import ACTION_NAMES, OBSERVATIONS, Role, canonical_name, numbers
 from signatures.spec import Memory, PolicySignature, SourceMap, TensorSpec, sources
@@ -119,7 +121,15 @@ def build_signature(compiled: Compilation) -> tuple[PolicySignature, dict[str, s
     )
     if facts.labels:
         signature = replace(signature, labels=remaining(_rename_labels(facts.labels, feeds), signature))
-    return signature, feeds, named
+    return _with_interface(signature, facts.interface, feeds), feeds, named
+
+
+def _with_interface(signature: PolicySignature, stated: Interface | None, feeds: Mapping[str, str]) -> PolicySignature:
+    """The signature with what sources state of its numbers, and their names where no labels are given."""
+    if not stated:
+        return signature
+    fitted, notes = fit_interface(stated, signature, feeds)
+    return name_numbers(replace(signature, interface=fitted, notes=(*signature.notes, *notes)))
 
 
 def _rename_labels(labels: Mapping[str, Any], feeds: Mapping[str, str]) -> dict[str, Any]:

@@ -6,7 +6,7 @@ turned, a float cast, a row of memory reshaped); behind it the actions are broug
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Sequence, Set
 from functools import cached_property
 from typing import Any, NoReturn
 
@@ -24,6 +24,7 @@ from converters.graph.builder import Builder
 from converters.graph.nodes import Graph, NameScope, Node, ref, split_ref
 from converters.graph.types import FLOAT32, static_shape
 from converters.policy.policy import Policy
+from signatures.interface import Interface
 from signatures.roles import Role
 from signatures.spec import Memory, SourceMap, TensorSpec
 
@@ -152,6 +153,7 @@ class Dressing(Struct, dict=True):
             },
             notes=(*(n for n in self.policy.signature.notes if not LIFTED.fullmatch(n)), *self.notes),
             labels={},
+            interface=_interface_of(self.policy.signature.interface, {s.name for s in self.inputs if s.name in feeds}),
         )
         names = [s.name for s in signature.inputs], [s.name for s in signature.outputs]
         return Policy(
@@ -167,6 +169,13 @@ class Dressing(Struct, dict=True):
             constants=dict(self.constants),
             kept=dict(self.kept),
         )
+
+
+def _interface_of(interface: Interface | None, inputs: Set[str]) -> Interface | None:
+    """What is stated of the inputs that keep their names; the rest of it as it is."""
+    if interface is None:
+        return None
+    return replace(interface, observations={n: t for n, t in interface.observations.items() if n in inputs})
 
 
 def _plain(value: np.ndarray) -> int | list[int]:

@@ -43,6 +43,8 @@ def _facts_of_contract(facts: SourceFacts, signature: PolicySignature) -> Source
         algorithm=signature.algorithm or "",
         memory_layout=() if signature.memory is None else signature.memory.layout,
         labels=signature.labels,
+        interface=signature.interface,
+        ours=True,
     )
 
 

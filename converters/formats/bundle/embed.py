@@ -109,6 +109,8 @@ def facts_of(graph: Graph, contract: Contract | None, nodes: Mapping[str, str] |
         notes=tuple(n for n in signature.notes if n not in found_again and not n.startswith(FIXED_BATCH)),
         labels=signature.labels,
         memories=_separate_memories(contract, nodes or {}) or None,
+        interface=signature.interface,
+        ours=True,
     )
 
 

@@ -16,8 +16,10 @@ from converters.formats.bundle.embed import contract_of, redrawn
 from converters.formats.bundle.embed import facts_of as facts_of_contract
 from converters.formats.onnx.output_roles import is_scores, output_roles, positional
 from converters.formats.onnx.reader import OnnxModel
+from converters.formats.onnx.tensor_map import TENSORS_KEY
 from converters.graph.nodes import Graph, NameScope, Node, topological
 from converters.graph.ops.table import passes_on, traits
+from converters.interfaces.metadata import read_metadata
 from converters.policy.brains import depends_on_input
 from converters.policy.facts import DOUBLES_NARROWED, SourceFacts
 from converters.policy.generations import SAC_MEAN, torch_generation
@@ -50,6 +52,7 @@ def understand(model: OnnxModel) -> tuple[Graph, SourceFacts]:
         memories=model.memories or None,
         model_name=model.name,
         decisions=model.decisions,
+        interface=read_metadata({k: v for k, v in model.metadata.items() if k != TENSORS_KEY}),
     )
     if model.producer.startswith("tf2onnx"):
         facts = _of_tensorflow(model, facts, number)

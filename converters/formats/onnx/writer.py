@@ -287,6 +287,9 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
     used = {name for node in builder.nodes for name in node.input}
     present = used.union(*(node.output for node in builder.nodes), (s.name for s in policy.signature.inputs))
     tensors = builder.tensors(policy.graph, present).dumps()
+    interface = policy.signature.interface
+    # A scale that the graph computes is not to be read, and applied, once more.
+    stated = {} if interface is None or interface.baked else interface.metadata
     model = messages.model(
         policy.name,
         builder.nodes,
@@ -299,7 +302,7 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
         producer=PRODUCER,
         ir_version=IR_VERSIONS[options.opset],
         opset=options.opset,
-        props={EMBEDDED: options.contract, **({TENSORS_KEY: tensors} if tensors else {})},
+        props={**stated, EMBEDDED: options.contract, **({TENSORS_KEY: tensors} if tensors else {})},
     )
     if options.checked:
         _check(model, builder.detached, policy.name)

@@ -16,11 +16,13 @@ from converters.graph.program import Program, program_of
 from converters.graph.run import run_graph
 from converters.graph.shapes import numbers_made
 from converters.graph.size_limits import MAX_COMPUTED
+from converters.interfaces.text import ALL, loop_lines, term_lines
 from converters.policy.policy import Policy
 from signatures.code import CodeOptions
 from signatures.contract import EMBEDDED
 from signatures.errors import GraphError, UsageError
 from signatures.roles import Role
+from signatures.spec import PolicySignature
 
 #: Golden rows of the self test, and how far float32 may be off.
 ROWS = 3
@@ -60,15 +62,14 @@ def plan_of(policy: Policy, options: WriteOptions) -> Plan:
     header = header_of(policy.name, policy.signature, code)
     fetches = {f.spec.name: policy.fetches[f.spec.name] for f in header.answered}
     program = program_of(prepare(policy, PROGRAM), policy.feeds, fetches)
-    contract = "".join(c if c.isascii() else json.dumps(c)[1:-1] for c in options.contract)
-    contract = contract.replace("*/", "*\\/").replace("/*", "\\/*")
+    contract = _in_comment(options.contract)
     sizes = tuple(policy.signature.branches)
     chosen = next((f for f in header.outputs if f.spec.role is Role.LOG_PROBS), None)
     chosen = chosen if chosen is not None and sum(sizes) == chosen.size else None
     checked, golden = _golden(policy, header)
     weights = weights_of(program, options.weights, in_file=code.weights == "file")
     guarded = () if code.guard is None else _guarded(policy.name, header, code.guard)
-    text = f"   {EMBEDDED}: {contract}\n*/"
+    text = f"{_interface_lines(policy.signature)}   {EMBEDDED}: {contract}\n*/"
     return Plan(
         header=header,
         program=program,
@@ -99,6 +100,19 @@ def _guarded(name: str, header: Header, most: float) -> tuple[Guarded, ...]:
             fix="leave --guard out",
         )
     return tuple(found)
+
+
+def _in_comment(text: str) -> str:
+    text = "".join(c if c.isascii() else json.dumps(c)[1:-1] for c in text)
+    return text.replace("*/", "*\\/").replace("/*", "/\\u002a")
+
+
+def _interface_lines(signature: PolicySignature) -> str:
+    """Comment lines on what is stated of the numbers; none can be taken for the contract's, which begins otherwise."""
+    specs = (*signature.inputs, *(head.spec for head in signature.heads))
+    named = [(s.name, line) for s in specs for line in term_lines(signature, s.name)]
+    lines = [*(f"{name}: {line}" for name, line in named), *loop_lines(signature.interface, ALL)]
+    return "".join(f"   | {_in_comment(' '.join(line.split()))}\n" for line in lines)
 
 
 def formula(field: Field, floats: str) -> str:

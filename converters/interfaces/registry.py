@@ -1,0 +1,148 @@
+"""The table of what states an interface: files beside a policy, by name, in the order in which they are believed."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Iterator
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+from msgspec import Struct
+
+from converters.files.fetch import inside, read_bytes
+from converters.files.yaml_data import MAX_YAML_BYTES, read_yaml
+from converters.interfaces.isaac_lab import read_agent, read_descriptors, read_environment
+from converters.interfaces.leapp import read_pipeline
+from converters.interfaces.merge import merge
+from converters.interfaces.mlagents import read_configuration
+from converters.interfaces.table import Table
+from converters.interfaces.unitree import read_deploy
+from signatures.errors import DamagedFileError, ExportModelError
+from signatures.fields import printable
+from signatures.interface import Interface
+
+#: What ``--interface`` is given to leave out what lies beside a source.
+NO_INTERFACE = "none"
+#: Entries of a folder that are looked at.
+_MOST_ENTRIES = 2000
+#: The folder that Isaac Lab writes IO descriptors to.
+_DESCRIPTORS = "io_descriptors"
+#: Folders that trainers put models in, beside ``params/``: rsl_rl's, rl_games', skrl's.
+_BELOW_A_RUN = re.compile("exported|nn|checkpoints")
+_BOTH = ("observations", "actions")
+
+
+class InterfaceFile(Struct, frozen=True):
+    """A kind of file: what its name matches (``{folder}``: its folder's), keys of which it has one, its reader."""
+
+    label: str
+    pattern: str
+    keys: tuple[str, ...]
+    #: given what the file holds, the source's file name and the behavior's name
+    read: Callable[[Table, str, str], Interface]
+    #: whether it is for several behaviors, each of which may have a folder below its own
+    of_many: bool = False
+
+
+def _alone(read: Callable[[Table], Interface]) -> Callable[[Table, str, str], Interface]:
+    return lambda table, model, behavior: read(table)
+
+
+FILES = (
+    InterfaceFile("Isaac Lab's IO descriptors", "*IO_descriptors.yaml", _BOTH, _alone(read_descriptors)),
+    InterfaceFile("LEAPP's pipeline", "{folder}.yaml", ("models",), lambda t, model, _: read_pipeline(t, model)),
+    InterfaceFile("Unitree's deploy.yaml", "deploy.yaml", _BOTH, _alone(read_deploy)),
+    InterfaceFile("Isaac Lab's env.yaml", "env.yaml", ("decimation", *_BOTH), _alone(read_environment)),
+    InterfaceFile("Isaac Lab's agent.yaml", "agent.yaml", ("clip_actions", "params"), _alone(read_agent)),
+    InterfaceFile(
+        "ML-Agents' configuration.yaml",
+        "configuration.yaml",
+        ("behaviors",),
+        lambda t, _, name: read_configuration(t, name),
+        of_many=True,
+    ),
+)
+
+
+def files_beside(source: Path) -> Iterator[tuple[InterfaceFile, Path]]:
+    """Yield the files that may state the interface of what was read from ``source``, the most believed first.
+
+    A link that leads out of its folder is not followed.
+    """
+    folder = (source if source.is_dir() else source.parent).absolute()
+    places = [folder, folder / "params", folder / _DESCRIPTORS]
+    if _BELOW_A_RUN.fullmatch(folder.name):
+        places += [folder.parent, folder.parent / "params", folder.parent / _DESCRIPTORS]
+    for kind in FILES:
+        above = [folder.parent] if kind.of_many else []
+        for place in dict.fromkeys([*places, *above]):
+            for name in _names(place, kind.pattern.replace("{folder}", place.name)):
+                path = inside(place, name)
+                if path is not None and path.is_file():
+                    yield kind, place / name
+
+
+def _names(place: Path, pattern: str) -> list[str]:
+    """The names in a folder that match; only that of descriptors, which has few, is looked through."""
+    if place.name != _DESCRIPTORS or "*" not in pattern:
+        return [pattern.replace("*", "")]
+    try:
+        with os.scandir(place) as entries:
+            names = [e.name for _, e in zip(range(_MOST_ENTRIES), entries, strict=False)]
+    except OSError:
+        return []
+    return sorted(name for name in names if fnmatchcase(name, pattern))
+
+
+def read_beside(source: Path, name: str | None, wanted: str | None) -> tuple[Interface | None, tuple[str, ...]]:
+    """Return what the files beside a source state, and notes on those that could not be read.
+
+    ``name`` is the policy's where the source says it. ``wanted`` is a file to be read in their place, which must be one
+    of the known kinds: raises what ``read_interface`` raises.
+    """
+    if wanted == NO_INTERFACE:
+        return None, ()
+    behavior = name or (source.name if source.is_dir() else source.stem)
+    if wanted is not None:
+        return read_interface(Path(wanted), source.name, behavior), ()
+    found: Interface | None = None
+    notes: list[str] = []
+    for kind, path in files_beside(source):
+        try:
+            stated = _of_kind(kind, path, source.name, behavior)
+        except ExportModelError as error:
+            hint = f"; {error.fix}" if error.fix else ""
+            notes.append(printable(f"{path.name} beside the source is left out: {error.what}{hint}"[:500]))
+            continue
+        if stated is not None:
+            found, conflicts = (stated, ()) if found is None else merge(found, stated)
+            notes += conflicts
+    return found, tuple(notes)
+
+
+def read_interface(path: Path, model: str, behavior: str) -> Interface:
+    """Return what a file of one of the known kinds states, whatever its name.
+
+    Raises DamagedFileError, SourceError, RuntimeUnavailableError.
+    """
+    content = read_yaml(read_bytes(path, empty=True, most=MAX_YAML_BYTES), path.name)
+    own = [k for k in FILES if fnmatchcase(path.name, k.pattern.replace("{folder}", path.absolute().parent.name))]
+    for kind in [*own, *(k for k in FILES if k not in own)]:
+        if isinstance(content, dict) and any(key in content for key in kind.keys):
+            return kind.read(Table(content, printable(path.name)), model, behavior)
+    known = ", ".join(kind.label for kind in FILES)
+    raise DamagedFileError(
+        "states no interface",
+        where=str(path),
+        why="it has none of the keys of the known kinds",
+        fix=f"give one of {known}",
+    )
+
+
+def _of_kind(kind: InterfaceFile, path: Path, model: str, behavior: str) -> Interface | None:
+    """What a file states; None where it has the name alone."""
+    content = read_yaml(read_bytes(path, empty=True, most=MAX_YAML_BYTES), path.name)
+    if not isinstance(content, dict) or not any(key in content for key in kind.keys):
+        return None
+    return kind.read(Table(content, printable(path.name)), model, behavior)

@@ -1,0 +1,1 @@
+"""The card of a bundle: README.md for a model hub."""

@@ -1,0 +1,119 @@
+"""The card of a bundle: the same bytes twice, read by huggingface_hub's own classes, safe from names of strangers."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from signatures.contract import POLICY
+from tests.commands import export_model
+from tests.interfaces.made import run_with
+
+RETURNS = [1.0, 2.0, 3.0, 4.0]
+
+
+@pytest.fixture
+def bundle(tmp_path: Path) -> Path:
+    path = run_with(tmp_path, "IO_descriptors.yaml", place="io_descriptors")
+    ran = export_model(path, "-o", tmp_path / "out", "--to", "onnx,bytes", "--verify", "onnxruntime,numpy")
+    assert ran.status == 0, ran.err
+    return tmp_path / "out" / "policy"
+
+
+def played(name: str = "policy", environment: str = "Walker-v1") -> dict[str, Any]:
+    """As ``play --json`` prints it, as far as a card reads it."""
+    summary = {"returns": RETURNS}
+    return {
+        "policy": name,
+        "environment": environment,
+        "reference": {"name": "the original", **summary},
+        "played": [{"format": "onnx", "runtime": "onnxruntime", **summary}],
+    }
+
+
+def card(folder: Path, *options: object) -> str:
+    ran = export_model("card", folder, *options)
+    assert ran.status == 0, ran.err
+    return (folder / "README.md").read_text(encoding="utf-8")
+
+
+def test_the_same_bundle_gives_the_same_bytes(bundle: Path) -> None:
+    first = card(bundle)
+    assert card(bundle) == first
+    assert export_model("verify", bundle, "--runtimes", "onnxruntime").status == 0  # it does not disturb the bundle
+
+
+def test_it_says_what_the_contract_says(bundle: Path) -> None:
+    text = card(bundle)
+    contract = json.loads((bundle / POLICY).read_text())
+    for entry in contract["files"].values():
+        assert entry["sha256"] in text
+    data = (bundle / "policy.onnx").read_bytes()
+    assert hashlib.sha256(data).hexdigest() in text
+    assert contract["source"]["sha256"] in text
+    assert "base\\_ang\\_vel" in text and "rad/s" in text
+    assert "PASSED" in text and 'onnxruntime.InferenceSession("policy.onnx"' in text
+    assert "license:" not in text.split("---")[1]  # the user's to say
+
+
+def test_huggingface_hub_reads_it(bundle: Path, tmp_path: Path) -> None:
+    hub = pytest.importorskip("huggingface_hub", reason="pip install huggingface-hub: it is of the dev extra")
+    (tmp_path / "play.json").write_text(json.dumps(played()))
+    text = card(bundle, "--play", tmp_path / "play.json")
+    found = hub.ModelCard(text)
+    assert isinstance(found.data, hub.ModelCardData)
+    assert found.data.pipeline_tag == "reinforcement-learning"
+    assert {"reinforcement-learning", "onnx"} <= set(found.data.tags)
+    assert found.data.license is None
+    (result,) = found.data.eval_results
+    assert (result.task_type, result.dataset_name, result.metric_type) == (
+        *("reinforcement-learning", "Walker-v1"),
+        "mean_reward",
+    )
+    again = hub.ModelCard(f"---\n{found.data.to_yaml()}\n---\n{found.text}")
+    assert again.data.to_dict() == found.data.to_dict()
+
+
+def test_the_interval_of_four_returns(bundle: Path) -> None:
+    """By hand: the mean of 1 to 4 is 2.5, its error 0.6455, Student's quantile for 3 degrees of freedom 3.1824."""
+    (bundle / "play.json").write_text(json.dumps(played()))
+    assert "2.5 (0.4457 to 4.554)" in card(bundle)
+
+
+@pytest.mark.parametrize(
+    "record", [{}, [], {"policy": "other"}, {**played(), "reference": {"name": "x", "returns": ["a"]}}, played("other")]
+)
+def test_another_record_is_refused(bundle: Path, tmp_path: Path, record: object) -> None:
+    (tmp_path / "play.json").write_text(json.dumps(record))
+    ran = export_model("card", bundle, "--play", tmp_path / "play.json")
+    assert ran.status == 2 and "must be what 'export-model play" in ran.err
+
+
+def test_a_bundle_that_was_changed_or_is_none_is_refused(bundle: Path, tmp_path: Path) -> None:
+    (bundle / "policy.onnx").write_bytes(b"another")
+    ran = export_model("card", bundle)
+    assert ran.status == 2 and "policy.onnx" in ran.err
+    ran = export_model("card", tmp_path / "exported")
+    assert ran.status == 2 and "is not a bundle" in ran.err
+
+
+def test_names_of_strangers_stay_text(tmp_path: Path) -> None:
+    hub = pytest.importorskip("huggingface_hub", reason="pip install huggingface-hub: it is of the dev extra")
+    name = 'x"\n---\nlicense: mit\n``` | <script>alert(1)</script> [a](http://b)'.replace("\n", " ")
+    labels = {"interface": {"actions": [{"name": name, "size": 2, "scale": [2]}]}, "actions": [name[:100], "b"]}
+    (tmp_path / "labels.json").write_text(json.dumps(labels))
+    path = run_with(tmp_path)
+    asked = ("--labels", tmp_path / "labels.json", "--to", "onnx", "--verify", "none")
+    assert export_model(path, "-o", tmp_path / "out", *asked).status == 0
+    folder = tmp_path / "out" / "policy"
+    (folder / "play.json").write_text(json.dumps(played(environment="a: \"b' #c")))
+    text = card(folder)
+    found = hub.ModelCard(text)
+    assert found.data.license is None
+    assert found.data.eval_results[0].dataset_name == "a: \"b' #c"
+    outside = "".join(text.split("````")[::2]) if "````" in text else text
+    assert "<script>" not in outside and "[a](" not in outside
