@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from msgspec import Struct, field
@@ -28,6 +28,9 @@ from signatures.fields import printable
 from signatures.ids import bounds_text
 from signatures.roles import Role
 from signatures.spec import PolicySignature, TensorSpec
+
+if TYPE_CHECKING:
+    from converters.formats.litert.microcontrollers import Fit
 
 _FEED = {
     Role.VECTOR: "the agent's vector observation, as the environment gives it{normalised}",
@@ -70,6 +73,8 @@ class PolicyInspection(Struct, frozen=True):
     layers: Mapping[str, str] = field(default_factory=dict)
     #: why inputs and outputs have their roles, where it was asked
     decisions: Sequence[Decision] = ()
+    #: how its .tflite for one agent fits LiteRT for Microcontrollers; None where it has none
+    board: Fit | None = None
 
     def __repr__(self) -> str:
         able = [target for target, reason in self.targets.items() if reason is None]
@@ -84,6 +89,7 @@ class PolicyInspection(Struct, frozen=True):
             "layers": dict(self.layers),
             "ops": dict(self.ops),
             "targets": {t: {"ok": reason is None, "reason": reason} for t, reason in self.targets.items()},
+            **({} if self.board is None else {"board": {"lacks": list(self.board.lacks), "arena": self.board.arena}}),
             **({"why": [_reason(d) for d in self.decisions]} if self.decisions else {}),
         }
 
@@ -153,7 +159,8 @@ def inspect_source(
             layers = _layers(policy)
         parameters = sum(v.size for v in policy.graph.values() if v.ndim and v.dtype.kind == "f")
         decisions = decided.get(policy.name, ())
-        found.append(PolicyInspection(policy, ops, targets, parameters, layers, decisions))
+        board = None if targets["litert"] is not None else _board(source.path, policy)
+        found.append(PolicyInspection(policy, ops, targets, parameters, layers, decisions, board))
     return Inspection(
         path=source.path,
         kind=source.format.label,
@@ -185,6 +192,24 @@ def _refusal(path: Path, policy: Policy, target: Format) -> str | None:
     except ExportModelError as error:
         return error.what
     return None
+
+
+def _board(path: Path, policy: Policy) -> Fit | None:
+    """How the file for one agent would run on a board; None where it is for any number alone."""
+    from converters.formats.litert.microcontrollers import fit
+
+    try:
+        with naming(path):
+            (file,) = WRITTEN["litert"].artifact(policy, WriteOptions("{}", batch=1)).files.values()
+            return fit(file.to_bytes())
+    except ExportModelError:
+        return None
+
+
+def _board_line(fit: Fit) -> str:
+    if fit.lacks:
+        return paragraph(", ".join(fit.lacks), "LiteRT for Microcontrollers lacks: ", "  ")
+    return f"LiteRT for Microcontrollers: an arena of about {size_text(fit.arena)} (--to litert --batch 1)"
 
 
 def inspection_text(inspection: Inspection) -> str:
@@ -222,6 +247,7 @@ def _policy_text(inspected: PolicyInspection) -> str:
     lines.append(paragraph(", ".join(f"{op} {n}" for op, n in inspected.ops.items()), "ops: ", "  "))
     able = [t for t, reason in inspected.targets.items() if reason is None]
     lines.append(f"can be written as: {', '.join(able) or 'nothing'}")
+    lines += [] if inspected.board is None else [_board_line(inspected.board)]
     refused = {t: reason for t, reason in inspected.targets.items() if reason is not None}
     lines += [paragraph(reason, f"cannot be written as {t}: ", "  ") for t, reason in refused.items()]
     return "\n".join(lines)
