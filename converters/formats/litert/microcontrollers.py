@@ -10,12 +10,12 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
+from msgspec import Struct
 
 from converters.formats.litert.artifact import operator_of
 from converters.formats.litert.flatbuffer import Table, decode
 from converters.formats.litert.tensors import dims_of, dtype_of, entry_of
 from converters.graph.types import INT32, INT64
-from signatures.records import dataclass
 
 VERSION = "tflite-micro 0.dev20261023182759"
 _OPERATORS = frozenset(
@@ -42,8 +42,7 @@ _PER_TENSOR, _PER_OPERATOR, _PER_MODEL = 24, 112, 1200
 _ALIGNMENT = 16
 
 
-@dataclass(frozen=True, slots=True)
-class Fit:
+class Fit(Struct, frozen=True):
     """What stands against running a file (nothing where it runs), and the arena's bytes, about."""
 
     lacks: tuple[str, ...]
