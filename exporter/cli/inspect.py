@@ -79,8 +79,8 @@ def inspect_command(
     from converters.files.fetch import path_text
     from exporter.remote.fetching import nearby
 
-    if len(sources) > 1 and (logdir is not None or svg is not None):
-        raise UsageError("--logdir and --svg are for one source", fix="name one")
+    if len(sources) > 1:
+        _check_alone(logdir, svg)
     if not releases and (actions or brain_parameters is not None):
         raise UsageError("--actions and --brain-parameters are for --unity", fix="name a release: --unity R22")
     if releases:
@@ -102,8 +102,8 @@ def inspect_command(
             with nearby(source) as here:
                 if releases:
                     verdict, report = _unity(here, releases, sensors, actions, brain_parameters, as_json, svg)
-                    found.append(report)
                     status = max(status, verdict)
+                    found.append(report)
                 else:
                     read = read_options(step, sensors, trust_source, activation, normaliser, interface)
                     found.append(_inspect_source(here, compiling, read, logdir, svg, as_json=as_json, why=why))
@@ -116,10 +116,21 @@ def inspect_command(
             status = 2
     if as_json:
         say_json(found[0] if len(sources) == 1 else {"sources": found})
-    elif not releases and status == 0:
-        _say_next(sources)
+    _end(status, () if as_json or releases else sources)
+
+
+def _end(status: int, sources: Sequence[Path]) -> None:
+    """End with the status, or say what to do next with the sources."""
     if status:
         sys.exit(status)
+    if sources:
+        _say_next(sources)
+
+
+def _check_alone(logdir: Path | None, svg: Path | None) -> None:
+    """Raise UsageError for options that write what one source has."""
+    if logdir is not None or svg is not None:
+        raise UsageError("--logdir and --svg are for one source", fix="name one")
 
 
 def _say_next(sources: Sequence[Path]) -> None:

@@ -287,9 +287,6 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
     used = {name for node in builder.nodes for name in node.input}
     present = used.union(*(node.output for node in builder.nodes), (s.name for s in policy.signature.inputs))
     tensors = builder.tensors(policy.graph, present).dumps()
-    interface = policy.signature.interface
-    # A scale that the graph computes is not to be read, and applied, once more.
-    stated = {} if interface is None or interface.baked else interface.metadata
     model = messages.model(
         policy.name,
         builder.nodes,
@@ -302,11 +299,17 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
         producer=PRODUCER,
         ir_version=IR_VERSIONS[options.opset],
         opset=options.opset,
-        props={**stated, EMBEDDED: options.contract, **({TENSORS_KEY: tensors} if tensors else {})},
+        props={**_stated_metadata(policy), EMBEDDED: options.contract, **({TENSORS_KEY: tensors} if tensors else {})},
     )
     if options.checked:
         _check(model, builder.detached, policy.name)
     return files_of(model, builder.detached, f"{policy.name}.onnx")
+
+
+def _stated_metadata(policy: Policy) -> Mapping[str, str]:
+    """Return the source's own metadata; none where the graph computes its scales: they would be applied twice."""
+    interface = policy.signature.interface
+    return {} if interface is None or interface.baked else interface.metadata
 
 
 def _check(model: Any, detached: Detached, name: str) -> None:
