@@ -31,9 +31,10 @@ FORMATS: tuple[Format, ...] = tuple(
 #: What can be written, by key; and what is, where nobody says what.
 WRITTEN = {f.key: f for f in FORMATS if f.write is not None}
 DEFAULTS = tuple(f.key for f in WRITTEN.values() if f.default)
-#: Those that other rooms mean by what they are: what the numpy kernels run, pages load, Unity imports and compiles.
-FROZEN_GRAPH, SAVED_MODEL, TFJS, ONNX, BARRACUDA, CSHARP = (
-    WRITTEN[key] for key in ("bytes", "saved_model", "tfjs", "onnx", "nn", "csharp")
+#: Those that other rooms mean by what they are: what the numpy kernels run, pages load, Unity imports and compiles,
+#: boards run.
+FROZEN_GRAPH, SAVED_MODEL, TFJS, ONNX, BARRACUDA, CSHARP, LITERT = (
+    WRITTEN[key] for key in ("bytes", "saved_model", "tfjs", "onnx", "nn", "csharp", "litert")
 )
 
 

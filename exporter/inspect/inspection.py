@@ -13,7 +13,7 @@ from msgspec import Struct, field
 from converters.compiler.options import CompileOptions
 from converters.consumers.named_files import artifact_of
 from converters.formats.format import Format, WriteOptions
-from converters.formats.registry import WRITTEN
+from converters.formats.registry import LITERT, WRITTEN
 from converters.formats.source import ReadOptions
 from converters.graph.nodes import Graph
 from converters.interfaces.text import kept_text, loop_lines, tables
@@ -159,7 +159,7 @@ def inspect_source(
             layers = _layers(policy)
         parameters = sum(v.size for v in policy.graph.values() if v.ndim and v.dtype.kind == "f")
         decisions = decided.get(policy.name, ())
-        board = None if targets["litert"] is not None else _board(source.path, policy)
+        board = None if targets[LITERT.key] is not None else _board(source.path, policy)
         found.append(PolicyInspection(policy, ops, targets, parameters, layers, decisions, board))
     return Inspection(
         path=source.path,
@@ -200,7 +200,7 @@ def _board(path: Path, policy: Policy) -> Fit | None:
 
     try:
         with naming(path):
-            (file,) = WRITTEN["litert"].artifact(policy, WriteOptions("{}", batch=1)).files.values()
+            (file,) = LITERT.artifact(policy, WriteOptions("{}", batch=1)).files.values()
             return fit(file.to_bytes())
     except ExportModelError:
         return None
