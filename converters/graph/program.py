@@ -256,6 +256,11 @@ def _leave_out(program: Program) -> None:
     program.stages = kept[::-1]
 
 
+#: Terms of one loop's expression: a chain of ops without end would be one expression, which a compiler, too, reads
+#: recursively. The largest of the public policies has some hundred.
+MAX_TERMS = 512
+
+
 def _join(program: Program) -> None:
     """A stage that one other alone reads, element by element and in the same loops, becomes a part of that.
 
@@ -274,11 +279,14 @@ def _join_once(program: Program) -> bool:
     gone: set[Any] = set()
     for stage in program.stages:
         swap: dict[int, Expression] = {}
-        reducing, abouts = _reduces(stage.body), list[str]()
+        reducing, abouts, terms = _reduces(stage.body), list[str](), sum(1 for _ in every(stage.body))
         for place, found in _reads(stage, alone).items():
             before = alone[place]
             if reducing and _reduces(before.body):
                 continue
+            terms += sum(1 for _ in every(before.body))
+            if terms > MAX_TERMS:
+                break
             reducing = reducing or _reduces(before.body)
             turned = {id(a): b for a, b in zip(before.counters, stage.counters, strict=True)}
             swap |= dict.fromkeys(map(id, found), inline_scalars(before.body, turned))
