@@ -71,8 +71,7 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
 
 
 def _text(name: str, plan: Plan) -> str:
-    header, program = plan.header, plan.program
-    p, state = header.prefix, header.state
+    header, program, p = plan.header, plan.program, plan.header.prefix
     widen_where_used(program, plan.weights)
     words = C(p, plan.code.math == "own")
     printer = Printer(words, f"{p}_w_")
@@ -80,6 +79,15 @@ def _text(name: str, plan: Plan) -> str:
     by_name |= {f.spec.name: f"memory->{f.name}" for f in header.fed if f not in header.inputs}
     for key, tensor in program.inputs.items():
         printer.called(tensor.place, by_name[key])
+    body = _compute_lines(plan, printer)
+    choose = _choose(p, plan.chosen, plan.sizes, printer.function(gumbel, "row[i]", "u")) if plan.chosen else ""
+    parts = [*_declarations(name, plan, choose), *_definitions(plan, printer, words, body, choose)]
+    return "\n\n".join(parts) + "\n"
+
+
+def _compute_lines(plan: Plan, printer: Printer) -> list[str]:
+    """The lines of the function that computes: pointers, the loops, and what is handed on."""
+    header, program, state = plan.header, plan.program, plan.header.state
     statements = printer.body(program)
     places = [stage.result.place for stage in program.stages]
     body = [
@@ -94,11 +102,14 @@ def _text(name: str, plan: Plan) -> str:
         target = f"memory->{state.name}" if f is header.next_state and state else f"output->{f.name}"
         source = printer.name(program.outputs[f.spec.name].place)
         body.append(f"    for (int i = 0; i < {f.size}; i++) {target}[i] = {source}[i];")
-    sizes = plan.sizes
-    choose = _choose(p, plan.chosen, sizes, printer.function(gumbel, "row[i]", "u")) if plan.chosen else ""
-    normal = printer.function(box_muller, "radius", "turn") if header.noise else ""
-    draws = printer.draws or bool(header.noise) or bool(choose)
-    parts = [
+    return body
+
+
+def _declarations(name: str, plan: Plan, choose: str) -> list[str]:
+    """What a program that includes the header sees: structures and functions, with what they do."""
+    header, program = plan.header, plan.program
+    p, state, sizes, loads = header.prefix, header.state, plan.sizes, plan.weights.file is not None
+    return [
         f"/* {p}: a policy without a runtime. In one source file, write\n"
         f"       #define {p.upper()}_IMPLEMENTATION\n"
         f'       #include "{name}.h"\n'
@@ -138,6 +149,16 @@ def _text(name: str, plan: Plan) -> str:
         f"int {p}_selftest({p}_memory *memory);\n#endif",
         *([UNUSUAL_SAID.replace("$P", p).replace("$K", f"{plan.code.guard:g}").strip()] if plan.guarded else []),
         *([f"/* Draw a class for each of {len(sizes)} branches. */\n{choose.splitlines()[0]};"] if choose else []),
+    ]
+
+
+def _definitions(plan: Plan, printer: Printer, words: C, body: Sequence[str], choose: str) -> list[str]:
+    """What the one source file gets that defines the implementation."""
+    header = plan.header
+    p, loads = header.prefix, plan.weights.file is not None
+    normal = printer.function(box_muller, "radius", "turn") if header.noise else ""
+    draws = printer.draws or bool(header.noise) or bool(choose)
+    return [
         f"#ifdef __cplusplus\n}}\n#endif\n\n#endif\n\n"
         f"#ifdef {p.upper()}_IMPLEMENTATION\n#include <float.h>\n#include <math.h>\n#include <string.h>",
         *([_STRICT.strip()] if words.own else []),
@@ -165,7 +186,6 @@ def _text(name: str, plan: Plan) -> str:
         _selftest(plan, words),
         "#endif",
     ]
-    return "\n\n".join(parts) + "\n"
 
 
 def _choose(prefix: str, field: Field, sizes: Sequence[int], drawn: str) -> str:

@@ -72,34 +72,17 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
 
 def _text(file: str, plan: Plan) -> str:
     header, program = plan.header, plan.program
-    name, state = header.class_name, header.state
+    name = header.class_name
     words = CSharp(plan.code.math == "own")
     printer = Printer(words, "w_", (name, *sorted({f.name for f in (*header.fed, *header.answered)})))
     by_name = {f.spec.name: f for f in header.fed}
     for key, tensor in program.inputs.items():
         printer.called(tensor.place, by_name[key].name)
-    statements = printer.body(program, depth=2)
+    body = _compute_lines(plan, printer)
     places = [
         (printer.name(s.result.place), CS_TYPES[s.result.dtype.name], s.result.place.size) for s in program.stages
     ]
-    fields = [(printer.name(p), CS_TYPES[p.dtype.name]) for p in printer.inputs(program)]
-    arrays = [(printer.name(p), CS_TYPES[p.dtype.name]) for p in program.constants]
-    body = [f"        {kind}[] {n} = this.{n};" for n, kind in (*fields, *(p[:2] for p in places))]
-    body += [f"        {kind}[] {n} = {name}.{n};" for n, kind in arrays]  # a virtual machine looks up each static
-    body += statements
-    if plan.weights.file is not None:
-        wrong = 'throw new global::System.InvalidOperationException("load the weights first");'
-        body.insert(0, f"        if (!loaded) {wrong}")
-    for f in header.answered:
-        target = state if f is header.next_state and state else f
-        source = printer.name(program.outputs[f.spec.name].place)
-        body.append(f"        global::System.Array.Copy({source}, this.{target.name}, {f.size});")
     draws = printer.draws or bool(header.noise) or plan.chosen is not None
-    quiet = "".join(
-        f"        global::System.Array.Clear({f.name}, 0, {f.size});\n"
-        for f in (*header.noise, *((state,) if state else ()))
-    )
-    stream = "        stream = seed;\n" if draws else ""
     members = [
         _sizes(plan),
         "    // What the agent observes.\n" + "".join(map(_member, header.inputs)),
@@ -110,10 +93,7 @@ def _text(file: str, plan: Plan) -> str:
         "    // For computing.\n" + "".join(f"    readonly {k}[] {n} = new {k}[{size}];\n" for n, k, size in places),
     ]
     methods = [
-        "    /// <summary>A new agent, whose draws begin with a seed.</summary>\n"
-        f"    public {name}(ulong seed = 0) {{ Reset(seed); }}",
-        "    /// <summary>Begins an episode: no state, draws by a seed.</summary>\n"
-        f"    public void Reset(ulong seed = 0)\n    {{\n{stream}{quiet}    }}",
+        *_beginning(name, plan, draws=draws),
         "    /// <summary>Decides: draws the noise where there is some, then computes.</summary>\n"
         "    public void Act()\n    {\n"
         + "".join(f"        Normal({f.name});\n" for f in header.noise)
@@ -138,6 +118,43 @@ def _text(file: str, plan: Plan) -> str:
         f"/// <summary>One agent: what it observes, keeps and does are its members.</summary>\n"
         f"public sealed class {name}\n{{\n" + "\n\n".join(inner) + "\n}\n\n}\n"
     )
+
+
+def _compute_lines(plan: Plan, printer: Printer) -> list[str]:
+    """The lines of ``Compute``: arrays as locals, the loops, and what is handed on."""
+    header, program = plan.header, plan.program
+    statements = printer.body(program, depth=2)
+    fields = [*printer.inputs(program), *(s.result.place for s in program.stages)]
+    lines = [f"        {CS_TYPES[p.dtype.name]}[] {(n := printer.name(p))} = this.{n};" for p in fields]
+    lines += [  # a virtual machine looks up each static
+        f"        {CS_TYPES[p.dtype.name]}[] {(n := printer.name(p))} = {header.class_name}.{n};"
+        for p in program.constants
+    ]
+    lines += statements
+    if plan.weights.file is not None:
+        wrong = 'throw new global::System.InvalidOperationException("load the weights first");'
+        lines.insert(0, f"        if (!loaded) {wrong}")
+    for f in header.answered:
+        target = header.state if f is header.next_state and header.state else f
+        source = printer.name(program.outputs[f.spec.name].place)
+        lines.append(f"        global::System.Array.Copy({source}, this.{target.name}, {f.size});")
+    return lines
+
+
+def _beginning(name: str, plan: Plan, *, draws: bool) -> list[str]:
+    """The constructor and ``Reset``."""
+    header = plan.header
+    quiet = "".join(
+        f"        global::System.Array.Clear({f.name}, 0, {f.size});\n"
+        for f in (*header.noise, *((header.state,) if header.state else ()))
+    )
+    stream = "        stream = seed;\n" if draws else ""
+    return [
+        "    /// <summary>A new agent, whose draws begin with a seed.</summary>\n"
+        f"    public {name}(ulong seed = 0) {{ Reset(seed); }}",
+        "    /// <summary>Begins an episode: no state, draws by a seed.</summary>\n"
+        f"    public void Reset(ulong seed = 0)\n    {{\n{stream}{quiet}    }}",
+    ]
 
 
 def _sizes(plan: Plan) -> str:

@@ -71,18 +71,9 @@ def _text(name: str, plan: Plan) -> str:
     by_name = {f.spec.name: f.name for f in header.fed}
     for key, tensor in program.inputs.items():
         printer.called(tensor.place, by_name[key])
-    statements = printer.body(program, depth=2)
-    places = [stage.result.place for stage in program.stages]
-    aliases = sorted({*(printer.name(p) for p in printer.inputs(program)), *map(printer.name, places)})
-    body = [f"        const {{ {', '.join(aliases)} }} = this;"] if aliases else []
-    if plan.weights.file is not None:
-        body.insert(0, '        if (!loaded) throw new Error("load the weights first");')
+    body = _compute_lines(plan, printer)
     weights = _weights(name, plan, words, printer)
-    body += statements
-    for f in header.answered:
-        target = header.state if f is header.next_state and header.state else f
-        source = printer.name(program.outputs[f.spec.name].place)
-        body.append(f"        this.{target.name}.set({source});")
+    places = [stage.result.place for stage in program.stages]
     draws = printer.draws or bool(header.noise) or plan.chosen is not None
     quiet = [*header.noise, *([header.state] if header.state else [])]
     drawn = "".join(f"        this.normal(this.{f.name});\n" for f in header.noise)
@@ -107,12 +98,6 @@ def _text(name: str, plan: Plan) -> str:
         *([_UNIFORM] if draws else []),
         *([_NORMAL.replace("$X", printer.function(box_muller, "radius", "turn"))] if header.noise else []),
     ]
-    ports: dict[str, Any] = {
-        kind: {f.spec.name: [f.name, f.spec.dtype, list(f.spec.shape)] for f in some}
-        for kind, some in (("inputs", header.fed), ("outputs", header.outputs))
-    }
-    ports["branches"] = list(plan.sizes)
-    state = [header.state.name, header.next_state.spec.name] if header.state and header.next_state else None
     parts = [
         f"/* {header.class_name}: a policy without a runtime, for browsers, Node and others that have ES modules:\n"
         f'       import {{ {header.class_name} }} from "./{name}.mjs";\n'
@@ -123,10 +108,38 @@ def _text(name: str, plan: Plan) -> str:
         f"/** One agent: what it observes, keeps and does are its members, arrays that live as long as it. */\n"
         f"export class {header.class_name} {{\n" + "\n\n".join(methods) + "\n}",
         "/** Names of the contract: [member, dtype, shape]; the state's member, and the name of its next value. */\n"
-        f"export const ports = {json.dumps({**ports, 'state': state})};",
+        f"export const ports = {json.dumps(_ports(plan))};",
         f"export default {header.class_name};",
     ]
     return "\n\n".join(parts) + "\n"
+
+
+def _compute_lines(plan: Plan, printer: Printer) -> list[str]:
+    """The lines of ``compute``: the loops, and what is handed on."""
+    header, program = plan.header, plan.program
+    statements = printer.body(program, depth=2)
+    results = (printer.name(stage.result.place) for stage in program.stages)
+    aliases = sorted({*(printer.name(p) for p in printer.inputs(program)), *results})
+    lines = [f"        const {{ {', '.join(aliases)} }} = this;"] if aliases else []
+    if plan.weights.file is not None:
+        lines.insert(0, '        if (!loaded) throw new Error("load the weights first");')
+    lines += statements
+    for f in header.answered:
+        target = header.state if f is header.next_state and header.state else f
+        source = printer.name(program.outputs[f.spec.name].place)
+        lines.append(f"        this.{target.name}.set({source});")
+    return lines
+
+
+def _ports(plan: Plan) -> dict[str, Any]:
+    """Names of the contract, the branches and the state, as the module exports them."""
+    header = plan.header
+    ports: dict[str, Any] = {
+        kind: {f.spec.name: [f.name, f.spec.dtype, list(f.spec.shape)] for f in some}
+        for kind, some in (("inputs", header.fed), ("outputs", header.outputs))
+    }
+    state = [header.state.name, header.next_state.spec.name] if header.state and header.next_state else None
+    return {**ports, "branches": list(plan.sizes), "state": state}
 
 
 def _weights(name: str, plan: Plan, words: JavaScript, printer: Printer) -> list[str]:
