@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -63,7 +64,7 @@ def walk(start: Start, chain: Sequence[Hop], folder: Path) -> list[tuple[ExportR
     own = CompileOptions(inputs=start.inputs, outputs=start.outputs)
     # A name that a hop has changed is changed for good; so is an action without chance.
     names = "source" if all(h.names == "source" for h in chain) else "canonical"
-    last = replace(chain[-1], names=names, deterministic=any(h.deterministic for h in chain))
+    last = dataclasses.replace(chain[-1], names=names, deterministic=any(h.deterministic for h in chain))
     direct = exported(place, folder / "direct", last, own)
     found = []
     for number, wanted in enumerate(direct):

@@ -65,7 +65,7 @@ def test_every_condition_can_be_contradicted() -> None:
         node("two", "Neg", "one"),
         node("same", "Identity", "state"),
         node("shape", "Shape", "state"),
-        node("draw", "RandomStandardNormal", "shape", dtype="float32", seed=3),
+        node("draw", "RandomStandardNormal", "shape", dtype=np.dtype("float32"), seed=3),
         node("action", "Add", "same", "draw"),
     )
     (c,) = (c for _, c in compilations(graph(*nodes[:1], *nodes[3:]), CompileOptions(), SourceFacts()))

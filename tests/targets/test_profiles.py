@@ -33,8 +33,9 @@ FIXTURES = [
     *(p for room in ("sb3", "torch_checkpoint") for p in sorted((ROOT / "fixtures" / room).glob("*.onnx"))),
 ]
 BATCHES = (1, 3, 16)
-#: The ones that are ONNX; tests/legacy has the others, in TensorFlow 1.4 and 1.7.
-UNITY = [p for p in PROFILES if p.formats[0] == "onnx"]
+#: The ones for Unity's importers; tests/legacy has those of TensorFlowSharp, in TensorFlow 1.4 and 1.7, and
+#: tests/robots those of robots' runners, whose action is the mean.
+UNITY = [p for p in PROFILES if p.importers]
 
 #: Policies that a profile cannot hold: (file, profile) → what the refusal names.
 CANNOT_IN = {

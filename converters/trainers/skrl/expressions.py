@@ -13,11 +13,12 @@ from converters.trainers.pytorch.network import Network
 from signatures.errors import SourceError
 
 MAX_EXPRESSION = 300
-_OPS: Mapping[type[ast.operator], str] = {
-    ast.Add: "Add",
-    ast.Sub: "Sub",
-    ast.Mult: "Mul",
-    ast.Div: "RealDiv",
+_Operation = Callable[[Network, str, str], str]
+_OPERATIONS: Mapping[type[ast.operator], _Operation] = {
+    ast.Add: lambda net, a, b: net.add("Add", [a, b]),
+    ast.Sub: lambda net, a, b: net.add("Sub", [a, b]),
+    ast.Mult: lambda net, a, b: net.add("Mul", [a, b]),
+    ast.Div: lambda net, a, b: net.add("RealDiv", [a, b]),
 }
 
 
@@ -50,8 +51,8 @@ class _Expression:
             return net.floats(float(node.value))
         elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
             return net.add("Neg", [self.tensor(node.operand)])
-        elif isinstance(node, ast.BinOp) and type(node.op) in _OPS:
-            return net.add(_OPS[type(node.op)], [self.tensor(node.left), self.tensor(node.right)])
+        elif isinstance(node, ast.BinOp) and type(node.op) in _OPERATIONS:
+            return _OPERATIONS[type(node.op)](net, self.tensor(node.left), self.tensor(node.right))
         elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and not node.keywords:
             return self._call(node.func.id, node.args)
         raise self._refuse(f"has a part that is not known: {ast.unparse(node)[:60]}")
