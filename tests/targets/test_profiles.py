@@ -36,6 +36,7 @@ BATCHES = (1, 3, 16)
 #: The ones for Unity's importers; tests/legacy has those of TensorFlowSharp, in TensorFlow 1.4 and 1.7, and
 #: tests/robots those of robots' runners, whose action is the mean.
 UNITY = [p for p in PROFILES if p.importers]
+MLAGENTS = [p for p in PROFILES if not p.loaders]
 
 #: Policies that a profile cannot hold: (file, profile) → what the refusal names.
 CANNOT_IN = {
@@ -142,7 +143,7 @@ def test_masks_that_a_policy_lacks_are_supplied_and_applied(draws: bool, tmp_pat
     assert given["deterministic_discrete_actions"][:, 0].tolist() == allowed.tolist()
 
 
-@pytest.mark.parametrize("wanted", [p for p in PROFILES if p.name != "barracuda-1.0"], ids=lambda p: p.name)
+@pytest.mark.parametrize("wanted", [p for p in MLAGENTS if p.name != "barracuda-1.0"], ids=lambda p: p.name)
 def test_a_branch_of_one_action_is_held_beside_others(wanted: Profile, tmp_path: Path) -> None:
     """0.5 to 0.6 had branches; up to 0.4 such a policy is refused by the number of its branches."""
     path = tmp_path / "branches.bytes"
@@ -269,7 +270,7 @@ def test_a_last_action_of_another_width_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("wanted", "form"), [(p, f) for p in PROFILES for f in p.formats], ids=lambda v: getattr(v, "name", v)
+    ("wanted", "form"), [(p, f) for p in MLAGENTS for f in p.formats], ids=lambda v: getattr(v, "name", v)
 )
 def test_a_policy_of_a_single_action_keeps_its_inputs(wanted: Profile, form: str, tmp_path: Path) -> None:
     """Its action hangs on nothing; Unity looks for the observation and the masks all the same."""
