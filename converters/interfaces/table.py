@@ -23,7 +23,7 @@ _MOST_WHERE = 300
 
 
 class Table:
-    """Keys of ``content`` (nothing where it is no mapping), which is of ``file``, below ``path``.
+    """Keys of ``content`` (none unless it is a mapping), which is of ``file``, below ``path``.
 
     A value that is not what was asked for counts as not taken.
     """

@@ -3,8 +3,8 @@
 Formulas and defaults: torch/nn/modules/activation.py. ``elu`` and ``ELU`` are one. ``lrelu`` and ``crelu`` (CELU) are
 rsl_rl's (rsl_rl/utils/utils.py). No state dictionary has the activation: it is the user's word, or what the trainer
 wrote beside the checkpoint, or what the one script of a trainer has. Isaac Lab writes ``params/agent.yaml`` into a
-run's folder, where rsl_rl's ``model_<n>.pt`` lie. Of that file the lines ``key: value`` are read by their indentation;
-nothing of YAML is needed beyond that.
+run's folder, where rsl_rl's ``model_<n>.pt`` lie. Of that file the lines ``key: value`` are read by their indentation:
+the base install has no PyYAML, which ``files/yaml_data.py`` needs for trainers that ask more of it.
 """
 
 from __future__ import annotations
