@@ -8,7 +8,7 @@ from msgspec import Struct, field
 from msgspec.structs import replace
 
 from converters.compiler.options import CompileOptions
-from converters.graph.nodes import Graph
+from converters.graph.nodes import Graph, SourceName
 from converters.policy.action import ActionMeaning
 from converters.policy.brains import Brain
 from converters.policy.facts import SourceFacts
@@ -35,7 +35,7 @@ class Compilation(Struct, frozen=True):
     #: canonical output → tensor
     fetches: Mapping[str, str]
     #: canonical output → its name in the source
-    sources: Mapping[str, str | tuple[str, ...] | None]
+    sources: Mapping[str, SourceName]
     #: the source's tensors that the memory was joined from
     parts: Mapping[Role, tuple[SourcePart, ...]] = field(default_factory=dict)
     #: action → what it is

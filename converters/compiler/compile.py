@@ -29,7 +29,7 @@ from converters.compiler.passes.simplify import collapse_views, drop_identities
 from converters.compiler.passes.small_integers import widen_small_integers
 from converters.compiler.passes.transposes import cancel_transposes
 from converters.compiler.passes.unroll import MAX_NODES, unroll
-from converters.graph.nodes import Graph, Node, node_of, split_ref, topological
+from converters.graph.nodes import Graph, Node, SourceName, node_of, split_ref, topological
 from converters.graph.ops.table import is_fed
 from converters.policy.brains import Brain, explain_outputs, find_brains
 from converters.policy.facts import SourceFacts
@@ -185,7 +185,7 @@ def _for_any_number(graph: Graph, options: CompileOptions, facts: SourceFacts) -
     return made, replace(facts, rows=rows, notes=(*facts.notes, note), memories=facts.memories or None)
 
 
-def _source_of(graph: Graph, reference: str) -> str | tuple[str, ...] | None:
+def _source_of(graph: Graph, reference: str) -> SourceName:
     """The source's name for a tensor: what its node carries, ``node:k`` for further outputs."""
     name, index = split_ref(reference)
     return graph[name].origin if index == 0 else f"{name}:{index}"

@@ -15,12 +15,12 @@ import numpy as np
 import numpy.typing as npt
 from msgspec.structs import replace
 
-from converters.graph.nodes import Graph, NameScope, Node, TensorShape, node_of, ref, topological
+from converters.graph.nodes import Graph, NameScope, Node, SourceName, TensorShape, node_of, ref, topological
 from converters.graph.ops.base import REQUIRED, axis_within
 from converters.graph.ops.table import TABLE, op_of
 from converters.graph.shapes import Types, add_types, outputs_of
 from converters.graph.size_limits import MAX_MADE, Allowance
-from converters.graph.types import FLOAT32, INT32, Dim, Symbols, TensorType, broadcast
+from converters.graph.types import FLOAT32, INT32, INT64, Dim, Symbols, TensorType, broadcast
 from signatures.errors import GraphError, UnsupportedOpError
 
 #: A policy has some hundreds.
@@ -36,7 +36,7 @@ class Builder:
     layer of the source, and names it.
     """
 
-    #: Whether types are inferred; without them every tensor is taken for float32 and nothing else is known.
+    #: Whether types are inferred as nodes are added; an editor infers them where it is asked.
     typed = True
 
     def __init__(self, names: NameScope) -> None:
@@ -59,7 +59,7 @@ class Builder:
         op: str,
         inputs: Sequence[str],
         name: str = "",
-        origin: str | tuple[str, ...] | None = None,
+        origin: SourceName = None,
         **attrs: Any,
     ) -> str:
         """A new node with the op's default attributes; returns its output 0."""
@@ -67,7 +67,7 @@ class Builder:
         return self.append(Node(self._fresh(name or op), op, tuple(inputs), {**defaults, **attrs}, origin=origin))
 
     def named_input(
-        self, name: str, dtype: np.dtype[Any], dims: Sequence[int | None], origin: str | tuple[str, ...] | None = None
+        self, name: str, dtype: np.dtype[Any], dims: Sequence[int | None], origin: SourceName = None
     ) -> str:
         """A named placeholder; None marks a dynamic axis."""
         attrs = {"dtype": dtype, "shape": TensorShape(tuple(dims))}
@@ -77,7 +77,7 @@ class Builder:
         """A constant; equal small ones under one prefix share a node."""
         array = np.asarray(array)
         key = None
-        if self.prefix and array.size <= _SHARED_CONSTANT:
+        if self.typed and self.prefix and array.size <= _SHARED_CONSTANT:
             key = (self.prefix, array.dtype.str, array.shape, array.tobytes())
             if key in self._constants:
                 return self._constants[key]
@@ -129,7 +129,7 @@ class Builder:
         self.nodes.append(node)
         return node.name
 
-    def rename(self, node: str, name: str, origin: str | tuple[str, ...] | None) -> str:
+    def rename(self, node: str, name: str, origin: SourceName) -> str:
         """Call a node of one output, which no other reads, by a name that is its own; returns it."""
         at = self.position.pop(node)
         self.nodes[at] = replace(self.nodes[at], name=name, origin=origin)
@@ -159,7 +159,7 @@ class Builder:
 
     def dtype(self, reference: str) -> np.dtype:
         """The dtype of a tensor."""
-        return self.types[reference].dtype if self.typed else FLOAT32
+        return self.type_of(reference).dtype
 
     def is_float(self, reference: str) -> bool:
         """Whether a tensor holds floats."""
@@ -167,11 +167,11 @@ class Builder:
 
     def constant(self, reference: str) -> np.ndarray | None:
         """The value of a tensor that is the same in every run."""
-        return None if reference in self.tainted else self.types[reference].constant
+        return None if reference in self.tainted else self.type_of(reference).constant
 
     def constant_of(self, reference: str) -> np.ndarray | None:
         """The value of a tensor under what is assumed of the inputs (``sequence_length`` is 1)."""
-        return self.types[reference].constant
+        return self.type_of(reference).constant
 
     def needed_constant(self, reference: str, meaning: str) -> np.ndarray:
         """The value of an operand that must be known; raises UnsupportedOpError."""
@@ -194,7 +194,7 @@ class Builder:
 
     def shape(self, reference: str) -> tuple[Dim, ...]:
         """The shape of a tensor; raises UnsupportedOpError where not even its rank is known."""
-        shape = self.types[reference].shape
+        shape = self.type_of(reference).shape
         if shape is None:
             raise UnsupportedOpError("the rank of an input is not known", why="its meaning depends on the rank")
         return shape
@@ -236,13 +236,13 @@ class Builder:
 
     # ------------------------------------------------------------------ shapes as tensors
 
-    def vector(self, dims: Sequence[Dim], *, open_axis: bool = False) -> str:
+    def vector(self, dims: Sequence[Dim], name: str = "shape", *, open_axis: bool = False) -> str:
         """An int32 shape vector. With ``open_axis`` a single symbol is written -1, for Reshape."""
         names = [d for d in dims if isinstance(d, str)]
         if not names or (open_axis and len(names) == 1 and -1 not in dims and 0 not in dims):
-            return self.ints([-1 if isinstance(d, str) else d for d in dims], "shape")
+            return self.ints([-1 if isinstance(d, str) else d for d in dims], name)
         parts = [self.length_of(d) if isinstance(d, str) else self.ints(d, "length") for d in dims]
-        return self.add("Pack", parts, "shape", axis=0)
+        return self.add("Pack", parts, name, axis=0)
 
     def length_of(self, symbol: str) -> str:
         """A scalar: the length that a symbol stands for, taken from a tensor that has it."""
@@ -274,10 +274,11 @@ class Builder:
             shrink_axis_mask=1,
         )
 
-    def reshape(self, reference: str, dims: Sequence[Dim]) -> str:
+    def reshape(self, reference: str, dims: Sequence[Dim], name: str = "", origin: SourceName = None) -> str:
         """The same elements under another shape (symbols allowed, -1 for one open axis)."""
-        made = self.add("Reshape", [reference, self.vector(dims, open_axis=True)])
-        if -1 not in dims:  # which symbol an open axis is, is known here
+        shape = self.vector(dims, f"{name}_shape" if name else "shape", open_axis=True)
+        made = self.add("Reshape", [reference, shape], name, origin)
+        if self.typed and -1 not in dims:  # which symbol an open axis is, is known here
             self.types[made] = replace(self.types[made], shape=tuple(dims))
         return made
 
@@ -301,9 +302,10 @@ class Builder:
         """Without the axes of length 1 at ``axes``."""
         return self.add("Squeeze", [reference], squeeze_dims=tuple(axes)) if axes else reference
 
-    def cast(self, reference: str, dtype: np.dtype) -> str:
+    def cast(self, reference: str, dtype: np.dtype, name: str = "") -> str:
         """The tensor in another dtype."""
-        return reference if self.dtype(reference) == dtype else self.add("Cast", [reference], DstT=np.dtype(dtype))
+        same = self.dtype(reference) == dtype
+        return reference if same else self.add("Cast", [reference], name, DstT=np.dtype(dtype))
 
     def slice(
         self, reference: str, axis: int, start: int | None, stop: int | None, step: int = 1, *, dropped: bool = False
@@ -342,9 +344,13 @@ class Builder:
         made = self.add("Split", [self.ints(1, "axis"), reference], num_split=count)
         return [ref(made, i) for i in range(count)]
 
-    def concat(self, parts: Sequence[str], axis: int) -> str:
+    def concat(self, parts: Sequence[str], axis: int, name: str = "") -> str:
         """Joined along an axis."""
-        return parts[0] if len(parts) == 1 else self.add("ConcatV2", [*parts, self.ints(axis, "axis")])
+        return parts[0] if len(parts) == 1 else self.add("ConcatV2", [*parts, self.ints(axis, "axis")], name)
+
+    def argmax(self, reference: str, axis: int, name: str = "", dtype: np.dtype = INT64) -> str:
+        """The index of the largest element along an axis."""
+        return self.add("ArgMax", [reference, self.ints(axis, "axis")], name, output_type=dtype)
 
     def reduce(self, kind: str, reference: str, axes: Sequence[int], *, keep: bool) -> str:
         """Sum, Mean, Max, Min or Prod over axes."""
@@ -352,7 +358,7 @@ class Builder:
 
     def broadcast(self, reference: str, dims: Sequence[Dim]) -> str:
         """The tensor repeated to a shape it broadcasts to. BroadcastTo came with TF 1.12; Tile was always there."""
-        shape = self.types[reference].shape
+        shape = self.type_of(reference).shape
         assert shape is not None
         if len(shape) < len(dims):
             shape = (1,) * (len(dims) - len(shape)) + shape

@@ -11,19 +11,18 @@ import numpy as np
 from msgspec.structs import replace
 
 from converters.graph.builder import Builder
-from converters.graph.nodes import Graph, NameScope, Node, topological
-from converters.graph.ops.base import Shape
+from converters.graph.nodes import Graph, NameScope, Node, SourceName, topological
+from converters.graph.ops.base import Older, Shape
 from converters.graph.ops.table import is_fed, op_of
 from converters.graph.shapes import add_types
-from converters.graph.size_limits import Allowance
-from converters.graph.types import Symbols, TensorType
+from converters.graph.types import TensorType
 from signatures.errors import ExportModelError, UnsupportedOpError
 
 
 class Editor(Builder):
     """A builder whose names keep off an old graph's; tensors of that may be redirected on the way.
 
-    It knows types only where it is asked: the ops of a graph that is not normalised yet need not be in the op table.
+    It infers types when it is asked for one: not every op of a graph that is not normalised yet is in the op table.
     """
 
     typed = False
@@ -32,9 +31,8 @@ class Editor(Builder):
         super().__init__(NameScope(n.name for n in graph.nodes))
         self._old = graph
         self._redirected: dict[str, str] = {}
-        #: Of how many of the new nodes the shapes were asked for, and what is known of them.
-        self._told, self._shapes = 0, dict[str, TensorType]()
-        self._symbols, self._allowance = Symbols(), Allowance()
+        #: Of how many of the new nodes the types are inferred.
+        self._told = 0
 
     def resolve(self, reference: str) -> str:
         """Where a tensor of the old graph is now."""
@@ -50,45 +48,64 @@ class Editor(Builder):
         """The node of the old graph that makes a tensor."""
         return self._old.producer(reference)
 
+    def keep_all(self) -> None:
+        """Take over every node of the old graph."""
+        for node in self._old.nodes:
+            self.keep(node)
+
+    def type_of(self, reference: str) -> TensorType:
+        """dtype, shape and value by what was made so far. Raises UnsupportedOpError where nothing is known of it."""
+        kind = self._kind_of(reference)
+        if kind is None:
+            raise UnsupportedOpError(f"the type of {reference!r} is not known before the graph runs")
+        return kind
+
     def shape_of(self, reference: str) -> Shape:
         """What is known of the shape of a tensor of the old graph by what was made so far; None: nothing."""
         kind = self._kind_of(reference)
         return None if kind is None else kind.shape
 
+    def constant(self, reference: str) -> np.ndarray | None:
+        """The value of a tensor that is the same in every run, by what was made so far; None: it is not known."""
+        kind = self._kind_of(reference)
+        return None if kind is None else kind.constant
+
     def known_value(self, reference: str, meaning: str) -> np.ndarray:
         """The value of a tensor of the old graph that no input changes; raises UnsupportedOpError."""
-        kind = self._kind_of(reference)
-        if kind is None or kind.constant is None:
+        value = self.constant(reference)
+        if value is None:
             why = f"{meaning} must be known before, in every target"
             raise UnsupportedOpError(f"{meaning} is computed while the graph runs", why=why)
-        return kind.constant
+        return value
 
     def write(self, operands: Sequence[str], layer: Callable[..., Sequence[str]], name: str) -> Sequence[str]:
         """What a layer of ``graph/nn`` makes of tensors of the old graph. Raises UnsupportedOpError."""
         typed = Builder(self.names)
-        typed.prefix, typed.symbols = name, self._symbols
+        typed.prefix, typed.symbols = name, self.symbols
         for reference in operands:
-            kind = self._kind_of(reference)
-            if kind is None:
-                raise UnsupportedOpError("the shape of its operand is not known")
-            typed.types[self.resolve(reference)] = kind
+            typed.types[self.resolve(reference)] = self.type_of(reference)
         made = layer(typed, *map(self.resolve, operands))
         for node in typed.nodes:
             older = op_of(node).older
             if older is None:
                 self.append(self._with_redirected_inputs(node))
             else:
-                attrs = {**node.attrs, "T": typed.dtype(node.inputs[-1])}
-                self.redirect(node.name, older(self, replace(node, attrs=attrs)))
+                self.write_older(replace(node, attrs={**node.attrs, "T": typed.dtype(node.inputs[-1])}), older)
         return [self.resolve(reference) for reference in made]
+
+    def write_older(self, node: Node, older: Older) -> None:
+        """Let every later reader of a node read what it is in older ops, under names that begin with its own."""
+        outer, self.prefix = self.prefix, node.name
+        self.redirect(node.name, older(self, node))
+        self.prefix = outer
 
     def _kind_of(self, reference: str) -> TensorType | None:
         while self._told < len(self.nodes):
             node = self._with_redirected_inputs(self.nodes[self._told])
             self._told += 1
             with contextlib.suppress(ExportModelError, KeyError):  # of a loop, or of what nothing may need: not known
-                add_types(self._shapes, node, self._symbols, self._allowance)
-        return self._shapes.get(self.resolve(reference))
+                add_types(self.types, node, self.symbols, self.allowance)
+        return self.types.get(self.resolve(reference))
 
     def redirect(self, reference: str, to: str) -> None:
         """Let every later reader of ``reference`` read ``to``."""
@@ -112,7 +129,7 @@ class Editor(Builder):
         op: str,
         inputs: Iterable[str],
         name: str = "",
-        origin: str | tuple[str, ...] | None = None,
+        origin: SourceName = None,
         **attrs: Any,
     ) -> str:
         """A new node with the op's default attributes under a fresh name like ``name``; returns its output 0."""
@@ -122,7 +139,7 @@ class Editor(Builder):
         """A free node name like ``wish``."""
         return self.names.fresh(wish)
 
-    def replace_const(self, name: str, array: np.ndarray, origin: str | tuple[str, ...] | None) -> str:
+    def replace_const(self, name: str, array: np.ndarray, origin: SourceName) -> str:
         """A Const under the name of the node of the old graph that it stands for."""
         return self.append(Node(name, "Const", value=array, origin=origin))
 

@@ -23,6 +23,10 @@ AttrValue = Any
 Inference = tuple[Sequence[TensorType], Sequence[TensorType], int]
 
 
+#: The source's name for what a node computes: a tensor, or several that were joined.
+SourceName = str | tuple[str, ...] | None
+
+
 class TensorShape(Struct, frozen=True):
     """A ``shape`` attribute: ``dims`` is None for an unknown rank, an entry is None for a free axis."""
 
@@ -43,7 +47,7 @@ class Node(Struct, frozen=True, dict=True):
     inputs: tuple[str, ...] = ()
     attrs: Mapping[str, AttrValue] = field(default_factory=dict)
     value: np.ndarray | None = None
-    origin: str | tuple[str, ...] | None = None
+    origin: SourceName = None
 
     @property
     def inference(self) -> Inference | None:

@@ -120,8 +120,7 @@ def _with_best(c: Compilation) -> Compilation:
             fix="export the network with one number per action, or give the output another role",
         )
     editor = Editor(c.graph)
-    for node in c.graph.nodes:
-        editor.keep(node)
+    editor.keep_all()
     axis, column = editor.ints(len(shape) - 1, "best/axis"), editor.ints([-1, 1], "best/column")
     best = editor.add("ArgMax", [values, axis], "best/argmax", output_type=INT64)
     action = editor.add("Reshape", [best, column], "best/action")

@@ -42,10 +42,9 @@ def settle_mixtures(c: Compilation) -> Compilation:
         others = [r for name, r in c.fetches.items() if name != head.name]
         if choice is None or not choice.samplers.isdisjoint(c.graph.ancestors(others)):
             continue
-        kind = infer_types(c.graph)[reference]
         editor = Editor(c.graph)
-        for node in c.graph.nodes:
-            editor.keep(node)
+        editor.keep_all()
+        kind = editor.type_of(reference)
         tiny = editor.floats(_NEVER, f"{_NAME}/never")
         likely = editor.add("Maximum", [choice.write(editor), tiny], f"{_NAME}/likely")
         one = editor.ints(1, f"{_NAME}/count")
@@ -57,10 +56,9 @@ def settle_mixtures(c: Compilation) -> Compilation:
             seed2=0,
             output_dtype=INT64,
         )
-        if kind.dtype != INT64:
-            drawn = editor.add("Cast", [drawn], f"{_NAME}/cast", DstT=kind.dtype)
+        drawn = editor.cast(drawn, kind.dtype, f"{_NAME}/cast")
         if kind.rank == 1:
-            drawn = editor.add("Reshape", [drawn, editor.ints([-1], f"{_NAME}/row")], f"{_NAME}/row")
+            drawn = editor.reshape(drawn, (-1,), f"{_NAME}/row")
         note = (
             f"{head.name} is by chance one of two, which the source draws one after the other (epsilon-greedy): it is "
             "drawn at once here, from the same probabilities, which the source has no tensor of to compare with"

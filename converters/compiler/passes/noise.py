@@ -19,7 +19,7 @@ from converters.graph.nodes import Graph, Node, TensorShape
 from converters.graph.ops.table import is_fed, op_of, traits
 from converters.graph.shapes import infer_types
 from converters.graph.size_limits import MAX_MADE, Allowance
-from converters.graph.types import BATCH, FLOAT32, INT32, Dim, static_shape
+from converters.graph.types import BATCH, FLOAT32, Dim, static_shape
 from signatures.errors import UnsupportedOpError
 from signatures.roles import Role
 
@@ -74,10 +74,9 @@ def settle_single_draws(c: Compilation) -> Compilation:
         if node.name not in single:
             editor.keep(node)
             continue
-        axis = editor.ints(1, f"{node.name}/axis")
-        best = editor.add("ArgMax", [node.inputs[0], axis], f"{node.name}/only", output_type=node.attrs["output_dtype"])
-        shape = editor.ints([-1, 1], f"{node.name}/column_shape")
-        editor.redirect(node.name, editor.add("Reshape", [best, shape], f"{node.name}/column", node.origin))
+        editor.prefix = node.name
+        best = editor.argmax(node.inputs[0], 1, "only", node.attrs["output_dtype"])
+        editor.redirect(node.name, editor.reshape(best, (-1, 1), "column", node.origin))
     fetches = {out: editor.resolve(reference) for out, reference in c.fetches.items()}
     return replace(c, graph=editor.graph(), fetches=fetches)
 
@@ -151,9 +150,8 @@ def _move_batch_first(editor: Editor, node: Node, dims: Sequence[int | None]) ->
     rows = editor.add_name(f"{node.name}/rows")
     editor.nodes.append(Node(rows, "Placeholder", attrs=attrs, origin=node.origin))
     if len(others) > 1:
-        shape = editor.ints([-1, *others], f"{node.name}/shape")
-        rows = editor.add("Reshape", [rows, shape], f"{node.name}/split")
-    order = editor.const(np.array([*range(1, axis + 1), 0, *range(axis + 1, len(dims))], INT32), f"{node.name}/order")
+        rows = editor.reshape(rows, (-1, *others), f"{node.name}/split")
+    order = editor.ints([*range(1, axis + 1), 0, *range(axis + 1, len(dims))], f"{node.name}/order")
     editor.nodes.append(Node(node.name, "Transpose", (rows, order), attrs={}))
 
 
@@ -186,8 +184,7 @@ def without_noise(
     editor, allowance = Editor(graph), Allowance()
     copies: dict[str, str] = {}
     zeros: set[str] = set()
-    for node in graph.nodes:
-        editor.keep(node)
+    editor.keep_all()
     for node in graph.nodes:
         if node.name not in wanted:
             continue

@@ -36,7 +36,7 @@ def normalise(graph: Graph, keep: Sequence[str] = ()) -> Graph:
             editor.keep(node)
         elif older := op_of(node).older:
             try:
-                editor.redirect(node.name, older(editor, given))
+                editor.write_older(given, older)
             except MISFIT as error:
                 raise misfit(given, error) from error
         else:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import numpy as np
 from msgspec.structs import replace
 
 from converters.compiler.compilation import Compilation
@@ -20,7 +19,7 @@ from converters.graph.editor import Editor
 from converters.graph.nodes import Graph, normal_ref
 from converters.graph.ops.table import traits
 from converters.graph.shapes import infer_types
-from converters.graph.types import FLOAT32, INT32, INT64, static_shape
+from converters.graph.types import FLOAT32, INT64, static_shape
 from converters.policy.action import ActionMeaning
 from converters.policy.brains import Head
 from signatures.errors import GraphError, SignatureError, UnsupportedOpError
@@ -94,53 +93,33 @@ def add_companions(
         graph, quiet = without_noise(graph, scores or [action], noise, name)
         scores, action = (quiet, action) if scores else (scores, quiet[0])
     editor = Editor(graph)
-    for node in graph.nodes:
-        editor.keep(node)
+    editor.keep_all()
     if meaning.role is Role.SAMPLED and LOG_PROBS not in fetches:
-        parts = [editor.add("LogSoftmax", [b], f"{LOG_PROBS}/branch_{i}") for i, b in enumerate(meaning.branches)]
-        added[LOG_PROBS] = _concat(editor, parts, LOG_PROBS)
+        editor.prefix = LOG_PROBS
+        parts = [editor.add("LogSoftmax", [b], f"branch_{i}") for i, b in enumerate(meaning.branches)]
+        added[LOG_PROBS] = editor.concat(parts, 1, "concat")
     if name not in fetches:
-        if scores:
-            added[name] = _argmax(editor, graph, scores, name)
-        else:
-            added[name] = _as_columns(editor, graph, action, name)
+        added[name] = _argmax(editor, scores, name) if scores else _as_columns(editor, action, name)
     return editor.graph(), added
 
 
-def _concat(editor: Editor, parts: Sequence[str], name: str) -> str:
-    if len(parts) == 1:
-        return parts[0]
-    axis = editor.ints(1, f"{name}/axis")
-    return editor.add("ConcatV2", [*parts, axis], f"{name}/concat")
-
-
-def _argmax(editor: Editor, graph: Graph, branches: Sequence[str], name: str) -> str:
-    columns, types = [], infer_types(graph)
+def _argmax(editor: Editor, branches: Sequence[str], name: str) -> str:
+    columns = []
     for i, branch in enumerate(branches):
-        prefix = f"{name}/branch_{i}"
-        shape = types[branch].shape or ()
+        editor.prefix = f"{name}/branch_{i}"
+        shape = editor.type_of(branch).shape or ()
         if len(shape) > 2 and isinstance(shape[-1], int):  # [B, 1, n]
-            row = editor.const(np.array([-1, shape[-1]], INT32), f"{prefix}/row_shape")
-            branch = editor.add("Reshape", [branch, row], f"{prefix}/row")
-        axis = editor.ints(1, f"{prefix}/axis")
-        best = editor.add("ArgMax", [branch, axis], f"{prefix}/argmax", output_type=INT64)
-        columns.append(editor.add("Reshape", [best, _column_shape(editor, prefix)], f"{prefix}/column"))
-    return _concat(editor, columns, name)
+            branch = editor.reshape(branch, (-1, shape[-1]), "row")
+        columns.append(editor.reshape(editor.argmax(branch, 1, "argmax"), (-1, 1), "column"))
+    editor.prefix = name
+    return editor.concat(columns, 1, "concat")
 
 
-def _as_columns(editor: Editor, graph: Graph, action: str, name: str) -> str:
+def _as_columns(editor: Editor, action: str, name: str) -> str:
     """An integer action whose scores are not in the graph: itself, as int64 [B, n]."""
-    kind = infer_types(graph)[action]
-    value = action
-    if kind.dtype != INT64:
-        value = editor.add("Cast", [value], f"{name}/int64", DstT=INT64)
-    if kind.rank == 1:
-        value = editor.add("Reshape", [value, _column_shape(editor, name)], f"{name}/column")
-    return value
-
-
-def _column_shape(editor: Editor, prefix: str) -> str:
-    return editor.ints([-1, 1], f"{prefix}/column_shape")
+    editor.prefix = name
+    value = editor.cast(action, INT64, "int64")
+    return editor.reshape(value, (-1, 1), "column") if editor.rank(action) == 1 else value
 
 
 def leave_out_without_rows(c: Compilation) -> Compilation:

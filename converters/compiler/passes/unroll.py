@@ -21,10 +21,9 @@ from msgspec.structs import replace
 
 from converters.graph.editor import Editor
 from converters.graph.nodes import Graph, Node, ref, split_ref
-from converters.graph.ops.table import CONTROL_FLOW, op_of, unsupported_error
-from converters.graph.shapes import Types, add_types, infer_types
-from converters.graph.size_limits import Allowance
-from converters.graph.types import INT32, Symbols, of_array
+from converters.graph.ops.table import CONTROL_FLOW, unsupported_error
+from converters.graph.shapes import Types, infer_types
+from converters.graph.types import INT32
 from signatures.errors import GraphError, NotAPolicyError, UnsupportedOpError
 
 MAX_TURNS = 64
@@ -77,11 +76,8 @@ class _Unroller:
         self.types: Types = infer_types(graph, partial=True)
         self.editor = Editor(graph)
         self.frames = _frames(graph)
-        self.made: dict[str, Node] = {}
         self.memo: dict[tuple[str, int | None], str | _Flow | None] = {}
-        self.known: dict[str, np.ndarray | None] = {}
         self.turns: dict[str, int] = {}
-        self.symbols, self.allowance = Symbols(), Allowance()
         self.handed_on = 0
         self.predicates = {self.frames[n.name]: n for n in graph.nodes if n.op == "LoopCond" and n.name in self.frames}
 
@@ -140,7 +136,6 @@ class _Unroller:
         name = node.name if not turn else self.editor.add_name(f"{node.name}/turn_{turn}")
         copy = Node(name, node.op, inputs, node.attrs, node.value, node.origin)
         self.editor.nodes.append(copy)
-        self.made[name] = copy
         return name
 
     def _control(self, node: Node, index: int, turn: int | None) -> str | _Flow | None:
@@ -224,7 +219,7 @@ class _Unroller:
 
     def _number(self, node: Node, reference: str, turn: int | None) -> int | None:
         """A condition, a size; None where it is not known. Raises GraphError where it is not a whole number."""
-        value = self.constant(self.plain(reference, turn))
+        value = self.editor.constant(self.plain(reference, turn))
         if value is None:
             return None
         if value.size != 1 or value.dtype.kind not in "biu":
@@ -232,7 +227,7 @@ class _Unroller:
         return int(value.item())
 
     def _indices(self, node: Node, reference: str, turn: int | None) -> list[int]:
-        value = self.constant(self.plain(reference, turn))
+        value = self.editor.constant(self.plain(reference, turn))
         if value is None:
             raise _undecided_loop(node, "the indices of a tensor array")
         self._room(value.size)  # each becomes nodes
@@ -348,35 +343,11 @@ class _Unroller:
 
     def _add(self, op: str, inputs: list[str], name: str, **attrs: Any) -> str:
         self._room(1)
-        made = self.editor.add(op, inputs, name, **attrs)
-        self.made[made] = self.editor.nodes[-1]
-        return made
+        return self.editor.add(op, inputs, name, **attrs)
 
     def _const(self, array: np.ndarray, name: str) -> str:
         self._room(1)
-        made = self.editor.const(array, name)
-        self.made[made] = self.editor.nodes[-1]
-        return made
-
-    def constant(self, reference: str) -> np.ndarray | None:
-        """The value of a tensor of the new graph, if it does not depend on an input."""
-        if reference not in self.known:
-            self.known[reference] = self._constant(reference)
-        return self.known[reference]
-
-    def _constant(self, reference: str) -> np.ndarray | None:
-        name, index = split_ref(reference)
-        node = self.made[name]
-        if node.value is not None:
-            return node.value
-        if name in self.graph and (known := self.types.get(reference)) is not None and known.constant is not None:
-            return known.constant
-        operands = [self.constant(r) for r in node.inputs]
-        if not operands or any(o is None for o in operands) or not op_of(node).foldable:
-            return None
-        types = {r: of_array(o) for r, o in zip(node.inputs, operands, strict=True) if o is not None}
-        add_types(types, node, self.symbols, self.allowance)
-        return types[ref(name, index)].constant
+        return self.editor.const(array, name)
 
 
 def _alive(value: str | _Flow | None) -> str | _Flow:

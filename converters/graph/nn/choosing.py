@@ -40,7 +40,7 @@ def top_k(b: Builder, x: str, k: int, *, largest: bool = True) -> tuple[str, str
     place = b.reduce("Sum", b.cast(b.add("LogicalOr", [better, tie]), FLOAT32), [rank], keep=False)
     places = b.const(np.arange(k, dtype=FLOAT32)[:, None], "places")
     chosen = b.add("Equal", [b.expand_dims(place, rank - 1), places])  # […, k, length]
-    index = b.add("ArgMax", [b.cast(chosen, FLOAT32), b.ints(rank, "axis")], output_type=INT64)
+    index = b.argmax(b.cast(chosen, FLOAT32), rank)
     return _sum_chosen(b, chosen, other, rank), index
 
 

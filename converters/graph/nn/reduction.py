@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from converters.graph.builder import Builder
-from converters.graph.types import INT64
 
 Reduction = Callable[[Builder, str, Sequence[int], bool], str]
 
@@ -63,6 +62,6 @@ def over_last_axis(b: Builder, op: str, x: str) -> str:
 def hardmax(b: Builder, x: str) -> str:
     """1 at the first largest element of the last axis, else 0."""
     axis = b.rank(x) - 1
-    best = b.add("ArgMax", [x, b.ints(axis, "axis")], output_type=INT64)
+    best = b.argmax(x, axis)
     depth = b.ints(b.length(x, axis), "depth")
     return b.add("OneHot", [best, depth, b.number(x, 1, "on"), b.number(x, 0, "off")], axis=-1)

@@ -11,9 +11,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Literal, Protocol
 
 import numpy as np
+import numpy.typing as npt
 from msgspec import Struct
 
-from converters.graph.nodes import Node
+from converters.graph.nodes import Node, SourceName
 from converters.graph.ops.litert.base import Litert
 from converters.graph.ops.loops.base import Loops
 from converters.graph.types import INT64, Dim, Symbols, TensorType, broadcast
@@ -59,9 +60,7 @@ class OnnxBuilder(Protocol):
 class NodeBuilder(Protocol):
     """What makes nodes."""
 
-    def add(
-        self, op: str, inputs: Sequence[str], name: str, origin: str | tuple[str, ...] | None = None, **attrs: Any
-    ) -> str:
+    def add(self, op: str, inputs: Sequence[str], name: str, origin: SourceName = None, **attrs: Any) -> str:
         """A new node under a fresh name like ``name``; returns its output 0."""
 
     def const(self, array: np.ndarray, name: str) -> str:
@@ -70,6 +69,9 @@ class NodeBuilder(Protocol):
 
 class GraphBuilder(NodeBuilder, Protocol):
     """What an op that is written as other ops may use; ``converters.graph.editor.Editor`` is one."""
+
+    def ints(self, numbers: npt.ArrayLike, name: str = "const") -> str:
+        """An int32 constant: a vector, or a scalar."""
 
     def constant_of(self, reference: str) -> np.ndarray | None:
         """The value of a tensor of the old graph that is a Const."""
@@ -96,7 +98,7 @@ class GraphBuilder(NodeBuilder, Protocol):
 Lower = Callable[[Node, OnnxBuilder], Any]
 #: How many rows the table has that an op looks up, by the types of its operands; None where that is not known.
 TableSize = Callable[[Node, Sequence[TensorType]], int | None]
-#: A node as nodes of older ops; returns the tensor that stands for its output 0.
+#: A node as nodes of older ops, whose names begin with its own; returns the tensor that stands for its output 0.
 Older = Callable[[GraphBuilder, Node], str]
 #: A node as TensorFlow.js computes it rightly: further nodes are added, the one that takes its place is returned.
 Tfjs = Callable[[GraphBuilder, Node, Mapping[str, TensorType]], Node]

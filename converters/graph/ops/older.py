@@ -26,31 +26,29 @@ def _dtype(node: Node) -> np.dtype:
 def clip(builder: GraphBuilder, node: Node) -> str:
     """ClipByValue (TF 1.8) = Maximum(Minimum(x, high), low), the order that tf.clip_by_value had before."""
     x, low, high = node.inputs
-    upper = builder.add("Minimum", [x, high], f"{node.name}/Minimum")
-    return builder.add("Maximum", [upper, low], f"{node.name}/Maximum", node.origin)
+    upper = builder.add("Minimum", [x, high], "Minimum")
+    return builder.add("Maximum", [upper, low], "Maximum", node.origin)
 
 
 def leaky_relu(builder: GraphBuilder, node: Node) -> str:
     """LeakyRelu (TF 1.8) = Maximum(x, alpha·x) for alpha ≤ 1, Minimum above."""
     alpha = float(node.attrs.get("alpha", 0.2))
-    slope = builder.const(np.array(alpha, _dtype(node)), f"{node.name}/alpha")
-    scaled = builder.add("Mul", [node.inputs[0], slope], f"{node.name}/mul")
-    return builder.add(
-        "Maximum" if alpha <= 1 else "Minimum", [node.inputs[0], scaled], f"{node.name}/leaky", node.origin
-    )
+    slope = builder.const(np.array(alpha, _dtype(node)), "alpha")
+    scaled = builder.add("Mul", [node.inputs[0], slope], "mul")
+    return builder.add("Maximum" if alpha <= 1 else "Minimum", [node.inputs[0], scaled], "leaky", node.origin)
 
 
 def _div_no_nan(builder: GraphBuilder, node: Node) -> str:
     """DivNoNan: x / y, and where y is 0 the zeros of ZerosLike, whatever x is; y is broadcast by adding them."""
     x, y = node.inputs
     dtype = _dtype(node)
-    quotient = builder.add("RealDiv", [x, y], f"{node.name}/quotient")
-    zeros = builder.add("ZerosLike", [quotient], f"{node.name}/zeros")
-    equal = builder.add("Equal", [y, builder.const(np.zeros((), dtype), f"{node.name}/0")], f"{node.name}/equal")
-    as_number = builder.add("Cast", [equal], f"{node.name}/number", DstT=dtype)
-    wide = builder.add("Add", [as_number, zeros], f"{node.name}/wide")
-    is_zero = builder.add("Cast", [wide], f"{node.name}/is_zero", DstT=BOOL)
-    return builder.add("Select", [is_zero, zeros, quotient], f"{node.name}/no_nan", node.origin)
+    quotient = builder.add("RealDiv", [x, y], "quotient")
+    zeros = builder.add("ZerosLike", [quotient], "zeros")
+    equal = builder.add("Equal", [y, builder.const(np.zeros((), dtype), "0")], "equal")
+    as_number = builder.add("Cast", [equal], "number", DstT=dtype)
+    wide = builder.add("Add", [as_number, zeros], "wide")
+    is_zero = builder.add("Cast", [wide], "is_zero", DstT=BOOL)
+    return builder.add("Select", [is_zero, zeros, quotient], "no_nan", node.origin)
 
 
 def select_v2(builder: GraphBuilder, node: Node) -> str:
@@ -59,23 +57,23 @@ def select_v2(builder: GraphBuilder, node: Node) -> str:
     dtype = _dtype(node)
 
     def cast(tensor: str, to: np.dtype, name: str) -> str:
-        return builder.add("Cast", [tensor], f"{node.name}/{name}", DstT=to)
+        return builder.add("Cast", [tensor], name, DstT=to)
 
     as_float = cast(condition, FLOAT32, "float")
-    zeros = builder.add("ZerosLike", [as_float], f"{node.name}/zeros")
+    zeros = builder.add("ZerosLike", [as_float], "zeros")
     for side, tensor in (("a", a), ("b", b)):
-        like = builder.add("ZerosLike", [tensor], f"{node.name}/zeros_{side}")
+        like = builder.add("ZerosLike", [tensor], f"zeros_{side}")
         like = like if dtype == FLOAT32 else cast(like, FLOAT32, f"zeros_{side}_float")
-        zeros = builder.add("Add", [zeros, like], f"{node.name}/zeros_{side}_sum")
-    wide = cast(builder.add("Add", [as_float, zeros], f"{node.name}/wide"), BOOL, "c")
+        zeros = builder.add("Add", [zeros, like], f"zeros_{side}_sum")
+    wide = cast(builder.add("Add", [as_float, zeros], "wide"), BOOL, "c")
     if dtype == BOOL:  # which Add does not take
         a, b = cast(a, FLOAT32, "a_float"), cast(b, FLOAT32, "b_float")
     elif dtype != FLOAT32:
         zeros = cast(zeros, dtype, "zeros_cast")
-    left, right = (builder.add("Add", [t, zeros], f"{node.name}/{side}") for side, t in (("a", a), ("b", b)))
+    left, right = (builder.add("Add", [t, zeros], side) for side, t in (("a", a), ("b", b)))
     if dtype == BOOL:
         left, right = cast(left, BOOL, "a_bool"), cast(right, BOOL, "b_bool")
-    return builder.add("Select", [wide, left, right], f"{node.name}/select", node.origin)
+    return builder.add("Select", [wide, left, right], "select", node.origin)
 
 
 def _batch_norm(builder: GraphBuilder, node: Node) -> str:
@@ -90,19 +88,19 @@ def _batch_norm(builder: GraphBuilder, node: Node) -> str:
             fix="freeze the graph with is_training=False",
         )
     x, scale, offset, mean, variance = node.inputs[:5]
-    epsilon = builder.const(np.array(node.attrs.get("epsilon", 1e-4), np.float32), f"{node.name}/epsilon")
-    positive = builder.add("Add", [variance, epsilon], f"{node.name}/var_eps")
-    deviation = builder.add("Sqrt", [positive], f"{node.name}/std")
-    factor = builder.add("RealDiv", [scale, deviation], f"{node.name}/factor")
+    epsilon = builder.const(np.array(node.attrs.get("epsilon", 1e-4), np.float32), "epsilon")
+    positive = builder.add("Add", [variance, epsilon], "var_eps")
+    deviation = builder.add("Sqrt", [positive], "std")
+    factor = builder.add("RealDiv", [scale, deviation], "factor")
     nchw = node.attrs.get("data_format") == "NCHW"
     if nchw:
-        x = builder.add("Transpose", [x, builder.const(TO_NHWC, f"{node.name}/nhwc/perm")], f"{node.name}/nhwc")
-    centred = builder.add("Sub", [x, mean], f"{node.name}/centred")
-    scaled = builder.add("Mul", [centred, factor], f"{node.name}/scaled")
-    result = builder.add("Add", [scaled, offset], f"{node.name}/y", node.origin)
+        x = builder.add("Transpose", [x, builder.const(TO_NHWC, "nhwc/perm")], "nhwc")
+    centred = builder.add("Sub", [x, mean], "centred")
+    scaled = builder.add("Mul", [centred, factor], "scaled")
+    result = builder.add("Add", [scaled, offset], "y", node.origin)
     if nchw:
-        perm = builder.const(TO_NCHW, f"{node.name}/nchw/perm")
-        result = builder.add("Transpose", [result, perm], f"{node.name}/nchw", node.origin)
+        perm = builder.const(TO_NCHW, "nchw/perm")
+        result = builder.add("Transpose", [result, perm], "nchw", node.origin)
     return result
 
 
@@ -142,20 +140,20 @@ def _channels_are_rows(builder: GraphBuilder, image: str, tensor: str) -> bool:
 
 def _layer_norm(builder: GraphBuilder, node: Node) -> str:
     """(x − mean)/√(variance + ε) over what a row [1, B, n, 1] has."""
-    axes = builder.const(np.array([2, 3], INT32), f"{node.name}/axes")
-    epsilon = builder.const(np.array(node.attrs.get("epsilon", 1e-4), FLOAT32), f"{node.name}/epsilon")
-    mean = builder.add("Mean", [node.inputs[0], axes], f"{node.name}/mean", keep_dims=True)
-    centred = builder.add("Sub", [node.inputs[0], mean], f"{node.name}/centred")
-    square = builder.add("Square", [centred], f"{node.name}/square")
-    variance = builder.add("Mean", [square, axes], f"{node.name}/variance", keep_dims=True)
-    positive = builder.add("Add", [variance, epsilon], f"{node.name}/var_eps")
-    deviation = builder.add("Sqrt", [positive], f"{node.name}/std")
-    return builder.add("RealDiv", [centred, deviation], f"{node.name}/y", node.origin)
+    axes = builder.ints([2, 3], "axes")
+    epsilon = builder.const(np.array(node.attrs.get("epsilon", 1e-4), FLOAT32), "epsilon")
+    mean = builder.add("Mean", [node.inputs[0], axes], "mean", keep_dims=True)
+    centred = builder.add("Sub", [node.inputs[0], mean], "centred")
+    square = builder.add("Square", [centred], "square")
+    variance = builder.add("Mean", [square, axes], "variance", keep_dims=True)
+    positive = builder.add("Add", [variance, epsilon], "var_eps")
+    deviation = builder.add("Sqrt", [positive], "std")
+    return builder.add("RealDiv", [centred, deviation], "y", node.origin)
 
 
 def _concat_v1(builder: GraphBuilder, node: Node) -> str:
     """Concat (axis first) as ConcatV2 (axis last)."""
-    return builder.add("ConcatV2", [*node.inputs[1:], node.inputs[0]], f"{node.name}/v2", node.origin)
+    return builder.add("ConcatV2", [*node.inputs[1:], node.inputs[0]], "v2", node.origin)
 
 
 def _identity_n(builder: GraphBuilder, node: Node) -> str:
@@ -177,10 +175,10 @@ def broadcast_to(builder: GraphBuilder, node: Node) -> str:
     dtype = _dtype(node)
     number = INT32 if dtype == BOOL else dtype
     if dtype == BOOL:
-        x = builder.add("Cast", [x], f"{node.name}/number", DstT=number)
-    ones = builder.add("Fill", [shape, builder.const(np.ones((), number), f"{node.name}/one")], f"{node.name}/ones")
-    wide = builder.add("Mul", [x, ones], f"{node.name}/wide", node.origin)
-    return wide if dtype != BOOL else builder.add("Cast", [wide], f"{node.name}/bool", node.origin, DstT=BOOL)
+        x = builder.add("Cast", [x], "number", DstT=number)
+    ones = builder.add("Fill", [shape, builder.const(np.ones((), number), "one")], "ones")
+    wide = builder.add("Mul", [x, ones], "wide", node.origin)
+    return wide if dtype != BOOL else builder.add("Cast", [wide], "bool", node.origin, DstT=BOOL)
 
 
 def _einsum(builder: GraphBuilder, node: Node) -> str:
@@ -190,7 +188,7 @@ def _einsum(builder: GraphBuilder, node: Node) -> str:
         return builder.shape_of(normal_ref(reference))
 
     try:
-        return einsum(builder, str(node.attrs.get("equation", "")), node.inputs, f"{node.name}/einsum", shape_of=shape)
+        return einsum(builder, str(node.attrs.get("equation", "")), node.inputs, "einsum", shape_of=shape)
     except UnsupportedOpError as error:
         what = f"cannot convert Einsum (node {node.name!r}): {error.what}"
         raise UnsupportedOpError(what, issues=[(node.name, node.op)], why=error.why) from error
@@ -198,13 +196,13 @@ def _einsum(builder: GraphBuilder, node: Node) -> str:
 
 def _erfc(builder: GraphBuilder, node: Node) -> str:
     """Erfc, which Keras' gelu is made of, as 1 − erf(x)."""
-    one = builder.const(np.ones((), _dtype(node)), f"{node.name}/one")
-    return builder.add("Sub", [one, builder.add("Erf", node.inputs, f"{node.name}/Erf")], f"{node.name}/rest")
+    one = builder.const(np.ones((), _dtype(node)), "one")
+    return builder.add("Sub", [one, builder.add("Erf", node.inputs, "Erf")], "rest")
 
 
 def _is_nan(builder: GraphBuilder, node: Node) -> str:
     """IsNan, which TensorFlow.js and older Barracudas lack: a NaN alone is not what it is."""
-    return builder.add("NotEqual", [node.inputs[0], node.inputs[0]], f"{node.name}/is_nan", node.origin)
+    return builder.add("NotEqual", [node.inputs[0], node.inputs[0]], "is_nan", node.origin)
 
 
 def _compared_with_largest(comparison: str) -> Older:
@@ -212,9 +210,9 @@ def _compared_with_largest(comparison: str) -> Older:
 
     def older(builder: GraphBuilder, node: Node) -> str:
         dtype = _dtype(node)
-        size = builder.add("Abs", [node.inputs[0]], f"{node.name}/abs")
-        largest = builder.const(np.array(np.finfo(dtype).max, dtype), f"{node.name}/largest")
-        return builder.add(comparison, [size, largest], f"{node.name}/compared", node.origin)
+        size = builder.add("Abs", [node.inputs[0]], "abs")
+        largest = builder.const(np.array(np.finfo(dtype).max, dtype), "largest")
+        return builder.add(comparison, [size, largest], "compared", node.origin)
 
     return older
 
@@ -229,7 +227,7 @@ def _top_k(builder: GraphBuilder, node: Node) -> str:
         what = f"cannot convert {node.op} (node {node.name!r}): {error.what}"
         raise UnsupportedOpError(what, issues=[(node.name, node.op)], why=error.why) from error
     wanted = node.attrs.get("index_type", INT32)
-    builder.redirect(ref(node.name, 1), builder.add("Cast", [places], f"{node.name}/places", node.origin, DstT=wanted))
+    builder.redirect(ref(node.name, 1), builder.add("Cast", [places], "places", node.origin, DstT=wanted))
     return best
 
 
@@ -248,39 +246,35 @@ def _reverse(builder: GraphBuilder, node: Node) -> str:
     count, mask = max(axes) + 1, (1 << (max(axes) + 1)) - 1
     steps = np.array([-1 if i in axes else 1 for i in range(count)], INT32)
     zeros = np.zeros(count, INT32)
-    bounds = [builder.const(a, f"{node.name}/{k}") for a, k in ((zeros, "begin"), (zeros, "end"), (steps, "steps"))]
-    return builder.add(
-        "StridedSlice", [tensor, *bounds], f"{node.name}/reversed", node.origin, begin_mask=mask, end_mask=mask
-    )
+    bounds = [builder.const(a, k) for a, k in ((zeros, "begin"), (zeros, "end"), (steps, "steps"))]
+    return builder.add("StridedSlice", [tensor, *bounds], "reversed", node.origin, begin_mask=mask, end_mask=mask)
 
 
 def _broadcast_args(builder: GraphBuilder, node: Node) -> str:
     """BroadcastArgs, the shape that two broadcast to: the larger lengths, ones before the shorter shape."""
     shapes = list(node.inputs)
-    counts = [builder.add("Size", [s], f"{node.name}/count", out_type=INT32) for s in shapes]
-    longer = builder.add("Maximum", counts, f"{node.name}/longer")
+    counts = [builder.add("Size", [s], "count", out_type=INT32) for s in shapes]
+    longer = builder.add("Maximum", counts, "longer")
     wide = []
     for shape, count in zip(shapes, counts, strict=True):
-        missing = builder.add("Sub", [longer, count], f"{node.name}/missing")
-        vector = builder.add("Pack", [missing], f"{node.name}/vector", axis=0)
-        one = builder.const(np.ones((), _dtype(node) if "T" in node.attrs else INT32), f"{node.name}/one")
-        ones = builder.add("Fill", [vector, one], f"{node.name}/ones")
-        axis = builder.const(np.array(0, INT32), f"{node.name}/axis")
-        wide.append(builder.add("ConcatV2", [ones, shape, axis], f"{node.name}/wide"))
-    return builder.add("Maximum", wide, f"{node.name}/shape", node.origin)
+        missing = builder.add("Sub", [longer, count], "missing")
+        vector = builder.add("Pack", [missing], "vector", axis=0)
+        one = builder.const(np.ones((), _dtype(node) if "T" in node.attrs else INT32), "one")
+        ones = builder.add("Fill", [vector, one], "ones")
+        axis = builder.ints(0, "axis")
+        wide.append(builder.add("ConcatV2", [ones, shape, axis], "wide"))
+    return builder.add("Maximum", wide, "shape", node.origin)
 
 
 def _uniform_int(builder: GraphBuilder, node: Node) -> str:
     """RandomUniformInt of low to high - 1, as the floor of a uniform number; up to high - low = 2^24 none is missed."""
     shape, low, high = node.inputs
     dtype = node.attrs.get("Tout", INT32)
-    count = builder.add("Sub", [high, low], f"{node.name}/count")
-    drawn = builder.add("RandomUniform", [shape], f"{node.name}/RandomUniform", seed=0, seed2=0, dtype=FLOAT32)
-    scale = builder.add("Cast", [count], f"{node.name}/scale", DstT=FLOAT32)
-    whole = builder.add("Floor", [builder.add("Mul", [drawn, scale], f"{node.name}/scaled")], f"{node.name}/floor")
-    return builder.add(
-        "Add", [builder.add("Cast", [whole], f"{node.name}/number", DstT=dtype), low], f"{node.name}/drawn", node.origin
-    )
+    count = builder.add("Sub", [high, low], "count")
+    drawn = builder.add("RandomUniform", [shape], "RandomUniform", seed=0, seed2=0, dtype=FLOAT32)
+    scale = builder.add("Cast", [count], "scale", DstT=FLOAT32)
+    whole = builder.add("Floor", [builder.add("Mul", [drawn, scale], "scaled")], "floor")
+    return builder.add("Add", [builder.add("Cast", [whole], "number", DstT=dtype), low], "drawn", node.origin)
 
 
 def _op_written_older(name: str, older: Older, *spellings: str) -> OpDef:
