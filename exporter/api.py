@@ -187,13 +187,11 @@ def compare_artefacts(
         report = compare_artefacts("3DBall.bytes", "theirs.onnx", names={"action": "Identity"})
         assert report.passed, report.failures
     """
-    return comparison.compare_artefacts(
-        reference,
-        candidates,
-        names=names,
-        runtimes=runtimes,
-        options=options,
+    how = comparison.CompareOptions(
+        names=names or {},
+        judging=interface.judged_by(runtimes, options),
         understanding=understanding,
         read=read,
         allow_unverified=allow_unverified,
     )
+    return comparison.compare_artefacts(reference, candidates, how)

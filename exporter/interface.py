@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from exporter.acting.loading import load_as
 from exporter.acting.policy import LoadedPolicy
-from exporter.compare.comparison import compare_artefacts
+from exporter.compare.comparison import CompareOptions, compare_artefacts
 from exporter.export.again import verify_folder
 from exporter.export.options import ExportOptions, storage
 from exporter.export.pipeline import ExportResult
@@ -221,17 +221,15 @@ def compare(
         report = export_model.compare("3DBall.bytes", "theirs.onnx", names={"action": "Identity"})
         assert report.passed, report.failures
     """
-    read, judging = read or ReadOptions(), judged_by(verify)
-    return compare_artefacts(
-        reference,
-        candidates,
-        names=names,
-        runtimes=judging.runtimes,
-        options=judging,
+    read = read or ReadOptions()
+    options = CompareOptions(
+        names=names or {},
+        judging=judged_by(verify),
         understanding=compile_options(read),
         read=read.for_reader(),
         allow_unverified=allow_unverified,
     )
+    return compare_artefacts(reference, candidates, options)
 
 
 def play(

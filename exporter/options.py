@@ -47,7 +47,13 @@ class ReadOptions(Struct, frozen=True, kw_only=True):
         normaliser = None if self.normaliser is None else str(self.normaliser)
         interface = None if self.interface is None else str(self.interface)
         return source.ReadOptions(
-            self.step, sensors, self.trust_source, tuple(self.goals), self.activation, normaliser, interface
+            step=self.step,
+            sensors=sensors,
+            trust_source=self.trust_source,
+            goals=tuple(self.goals),
+            activation=self.activation,
+            normaliser=normaliser,
+            interface=interface,
         )
 
 

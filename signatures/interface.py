@@ -163,15 +163,15 @@ def parse_interface(whole: Field, inputs: Sequence[str]) -> Interface | None:
     if seconds is not None and seconds <= 0:
         raise period["seconds"].error("must be above 0")
     return Interface(
-        {name: _entries(terms, _term) for name, terms in observations.items()},
-        _entries(whole["actions"], _term),
-        _entries(whole["baked"], _term),
-        None if seconds is None else (seconds, period["from"].text()),
-        _entries(whole["resets"], _statement),
-        _entries(whole["limits"], _quantity),
-        _entries(whole["quantities"], _quantity),
-        _entries(whole["kept"], _statement),
-        _metadata(whole["metadata"]),
+        observations={name: _entries(terms, _term) for name, terms in observations.items()},
+        actions=_entries(whole["actions"], _term),
+        baked=_entries(whole["baked"], _term),
+        period=None if seconds is None else (seconds, period["from"].text()),
+        resets=_entries(whole["resets"], _statement),
+        limits=_entries(whole["limits"], _quantity),
+        quantities=_entries(whole["quantities"], _quantity),
+        kept=_entries(whole["kept"], _statement),
+        metadata=_metadata(whole["metadata"]),
     )
 
 
@@ -182,15 +182,15 @@ def _entries(entries: Field, make: Callable[[Field], Any]) -> tuple[Any, ...]:
 def _term(entry: Field) -> Term:
     size, history = entry["size"], entry["history"]
     found = Term(
-        entry["name"].text(),
-        entry["from"].text(),
-        None if size.missing else size.integer(1, 1 << 24),
-        tuple(e.text() for e in entry["elements"].items(MAX_VALUES)),
-        None if entry["unit"].missing else entry["unit"].text(),
-        _numbers(entry["scale"]),
-        _numbers(entry["offset"]),
-        _ranges(entry["clip"]),
-        None if history.missing else history.integer(1, 1 << 16),
+        name=entry["name"].text(),
+        source=entry["from"].text(),
+        size=None if size.missing else size.integer(1, 1 << 24),
+        elements=tuple(e.text() for e in entry["elements"].items(MAX_VALUES)),
+        unit=None if entry["unit"].missing else entry["unit"].text(),
+        scale=_numbers(entry["scale"]),
+        offset=_numbers(entry["offset"]),
+        clip=_ranges(entry["clip"]),
+        history=None if history.missing else history.integer(1, 1 << 16),
     )
     for key in ("elements", "scale", "offset", "clip"):
         count = len(getattr(found, key))

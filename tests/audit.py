@@ -1,5 +1,6 @@
 """``python -m tests.audit``: the locked dependencies are what is installed, what is known against them, and that no
-function has grown too large (tests/function_sizes.py).
+function has grown too large (tests/function_sizes.py) or is called with too many arguments by place
+(tests/positional_arguments.py).
 
 Held without a network: what is installed of constraints.txt has the version of it, and every npm package of
 package-lock.json has a hash. Known vulnerabilities are pip-audit's and npm's to say, which ask
@@ -17,7 +18,7 @@ from collections.abc import Iterator
 from importlib.metadata import distributions
 from pathlib import Path
 
-from tests import function_sizes
+from tests import function_sizes, positional_arguments
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ROOT / "converters/runtimes/javascript/js"
@@ -65,8 +66,8 @@ def asked() -> Iterator[str]:
 
 
 def main() -> int:
-    """1 where something is not locked, or a function has become too large."""
-    found, large = list(faults()), list(function_sizes.faults())
+    """1 where something is not locked, a function has become too large, or arguments are told by place alone."""
+    found, large = list(faults()), [*function_sizes.faults(), *positional_arguments.faults()]
     for line in (*found, *asked(), *large):
         print(line)
     print(f"{len(locked())} Python packages and their npm packages are " + ("NOT as locked" if found else "as locked"))

@@ -25,7 +25,7 @@ def playable(profile: Profile, files: Mapping[str, Pieces], name: str) -> None:
         for played in (p for p in verdict.played if p.fails):
             why = f"{played.outcome.value}: {played.message} ({played.exception or 'no exception'})"
             advice = "" if f"--for {profile.name}" in played.fix else f"{played.fix}, "
-            _refuse(profile, verdict, name, played.where, why, played.evidence, advice)
+            _refuse(profile, verdict, name=name, where=played.where, why=why, evidence=played.evidence, advice=advice)
 
 
 def _verdicts(profile: Profile, files: Mapping[str, Pieces]) -> Iterator[UnityVerdict]:

@@ -65,15 +65,15 @@ def _descriptor_term(row: Table, offsets: tuple[str, ...]) -> Term:
     row.take("dtype", "mdp_type")
     overloads.take("flatten_history_dim")
     return Term(
-        name,
-        row.where(),
-        size,
-        elements if size in (None, len(elements)) else (),
-        extras.text("units"),
-        _fitting(row.numbers("scale") or overloads.numbers("scale"), size),
-        _fitting(next((found for key in offsets if (found := row.numbers(key))), ()), size),
-        _fitting(row.ranges("clip") or overloads.ranges("clip"), size),
-        None if frames is None else max(frames, 1),
+        name=name,
+        source=row.where(),
+        size=size,
+        elements=elements if size in (None, len(elements)) else (),
+        unit=extras.text("units"),
+        scale=_fitting(row.numbers("scale") or overloads.numbers("scale"), size),
+        offset=_fitting(next((found for key in offsets if (found := row.numbers(key))), ()), size),
+        clip=_fitting(row.ranges("clip") or overloads.ranges("clip"), size),
+        history=None if frames is None else max(frames, 1),
     )
 
 

@@ -23,15 +23,15 @@ def merge(first: Interface, second: Interface) -> tuple[Interface, tuple[str, ..
     if first.period and second.period and abs(first.period[0] - second.period[0]) > 1e-6:
         notes.append(_difference("the control period", first.period[1], second.period[1]))
     merged = Interface(
-        observations,
-        _terms(first.actions, second.actions, notes),
-        (*first.baked, *second.baked),
-        first.period or second.period,
-        (*first.resets, *second.resets),
-        _quantities(first.limits, second.limits),
-        _quantities(first.quantities, second.quantities),
-        (*first.kept, *second.kept),
-        {**second.metadata, **first.metadata},
+        observations=observations,
+        actions=_terms(first.actions, second.actions, notes),
+        baked=(*first.baked, *second.baked),
+        period=first.period or second.period,
+        resets=(*first.resets, *second.resets),
+        limits=_quantities(first.limits, second.limits),
+        quantities=_quantities(first.quantities, second.quantities),
+        kept=(*first.kept, *second.kept),
+        metadata={**second.metadata, **first.metadata},
     )
     return merged, tuple(notes)
 

@@ -48,9 +48,11 @@ def compare_command(
     options: VerifyOptions,
 ) -> None:
     """Compare files made by any tool with a reference: graphs, SavedModels, TensorFlow.js, ONNX, bundles."""
+    from msgspec.structs import replace
+
     from converters.files.fetch import path_text
     from converters.formats.source import ReadOptions
-    from exporter.compare.comparison import compare_artefacts
+    from exporter.compare.comparison import CompareOptions, compare_artefacts
     from exporter.reports.entry import Entry
 
     console.prepare()
@@ -59,12 +61,13 @@ def compare_command(
         report = compare_artefacts(
             reference,
             candidates,
-            names=pairs(mapped, "--map"),
-            runtimes=runtimes,
-            options=options,
-            understanding=compiling,
-            read=ReadOptions(trust_source=trust_source, normaliser=None if normaliser is None else str(normaliser)),
-            allow_unverified=allow_unverified,
+            CompareOptions(
+                names=pairs(mapped, "--map"),
+                judging=replace(options, runtimes=runtimes),
+                understanding=compiling,
+                read=ReadOptions(trust_source=trust_source, normaliser=None if normaliser is None else str(normaliser)),
+                allow_unverified=allow_unverified,
+            ),
             progress=progress,
             understood=read.append,
         )

@@ -156,7 +156,7 @@ def export_command(
     if many:
         from exporter.cli.fleet import run_fleet
 
-        run_fleet(sources, job, jobs, cluster, again, fail_fast, console)
+        run_fleet(sources, job, jobs=jobs, cluster=cluster, again=again, fail_fast=fail_fast, console=console)
     else:
         _export_few(sources, job, env, console)
 

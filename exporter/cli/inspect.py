@@ -101,7 +101,7 @@ def inspect_command(
         try:
             with nearby(source) as here:
                 if releases:
-                    verdict, report = _unity(here, releases, sensors, actions, brain_parameters, as_json, svg)
+                    verdict, report = _unity(here, releases, (sensors, actions, brain_parameters), as_json, svg)
                     status = max(status, verdict)
                     found.append(report)
                 else:
@@ -182,14 +182,13 @@ def _inspect_source(
 def _unity(
     source: Path,
     releases: tuple[str, ...],
-    sensors: str | None,
-    actions: str | None,
-    parameters: Path | None,
+    agent: tuple[str | None, str | None, Path | None],
     as_json: bool,
     svg: Path | None,
 ) -> tuple[int, dict[str, Any]]:
     from exporter.inspect.unity import all_accept, check_for_unity, unity_report, unity_text
 
+    sensors, actions, parameters = agent
     verdicts = check_for_unity(source, releases, sensors or "", actions or "", parameters)
     if svg is not None:
         if len(verdicts) != 1:

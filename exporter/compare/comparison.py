@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from msgspec import Struct
+from msgspec import Struct, field
 from msgspec.structs import replace
 
 from converters.compiler.options import CompileOptions
@@ -25,7 +25,6 @@ from converters.files.folders import scratch_folder, size_of
 from converters.formats.source import OriginalRun, ReadOptions
 from converters.policy.policy import Policy
 from converters.runtimes.pool import RuntimePool, chosen_runtimes
-from converters.runtimes.registry import RuntimeInfo
 from exporter.compare.matching import Candidate, match_candidates
 from exporter.compare.weights import compare_rounded, merge_reports, rounded_to
 from exporter.export.sources import read_source
@@ -46,6 +45,7 @@ from exporter.verify.participants import (
 )
 from exporter.verify.reference import random_outputs
 from exporter.verify.report import ParityReport
+from exporter.verify.session import Session
 from exporter.verify.tolerances import Tolerance, check_rules
 from exporter.verify.verification import Judge, verify
 from signatures.errors import RuntimeUnavailableError, UsageError, naming
@@ -55,16 +55,25 @@ _LOG = logging.getLogger(__name__)
 Progress = Callable[[str], None]
 
 
+class CompareOptions(Struct, frozen=True, kw_only=True):
+    """How to compare."""
+
+    #: a name of the reference → what the candidates call it
+    names: Mapping[str, str] = field(default_factory=dict)
+    #: runtimes, seed, samples, tolerances
+    judging: VerifyOptions = field(default_factory=VerifyOptions)
+    #: how to read the reference (the flags ``--input``, ``--output``, ``--step``, …)
+    understanding: CompileOptions | None = None
+    read: ReadOptions | None = None
+    #: no error where none of the candidates' runtimes is installed
+    allow_unverified: bool = False
+
+
 def compare_artefacts(
     reference: Path | str,
     candidates: Path | str | Sequence[Path | str],
+    options: CompareOptions | None = None,
     *,
-    names: Mapping[str, str] | None = None,
-    runtimes: str | Sequence[str] = "auto",
-    options: VerifyOptions | None = None,
-    understanding: CompileOptions | None = None,
-    read: ReadOptions | None = None,
-    allow_unverified: bool = False,
     progress: Progress = _LOG.info,
     understood: Callable[[Policy], object] | None = None,
     pool: RuntimePool | None = None,
@@ -72,46 +81,32 @@ def compare_artefacts(
 ) -> ParityReport:
     """Compare files that any tool made with a reference; every format of a candidate that is a bundle takes part.
 
-    - ``names``: a name of the reference → what the candidates call it.
-    - ``runtimes``: as in ``verify_bundle``; ``options``: seed, samples, tolerances.
-    - ``understanding``, ``read``: how to read the reference (the flags ``--input``, ``--output``, ``--step``, …).
-    - ``allow_unverified``: no error where none of the candidates' runtimes is installed.
     - ``progress``: called with each step; the default logs them.
     - ``understood``: called with the reference as it was understood, before anything runs.
     - ``judge``: what is made of the candidates' participants, in place of a verification.
 
     Raises ExportModelError where a file cannot be read, UsageError where a name of ``names`` is none,
-    RuntimeUnavailableError where no runtime could run any::
-
-        report = compare_artefacts("3DBall.bytes", "theirs.onnx", names={"action": "Identity"})
-        assert report.passed, report.failures
+    RuntimeUnavailableError where no runtime could run any.
     """
+    options = options or CompareOptions()
+    judging = options.judging
     with ExitStack() as opened:
         given = [candidates] if isinstance(candidates, Path | str) else candidates
         reference = opened.enter_context(nearby(Path(reference)))
         near = [opened.enter_context(nearby(Path(path))) for path in given]
-        policy, source = _reference(reference, understanding, read)
+        policy, source = _reference(reference, options.understanding, options.read)
         if understood is not None:
             understood(policy)
-        matched = match_candidates(policy, reference, near, names or {})
-        used, known = chosen_runtimes(runtimes, [m.format for m in matched])
-        if options is not None:
-            _check_options(options, policy, matched, used)
-        comparison = _Comparison(
-            policy=policy,
-            source=source,
-            runtimes=used,
-            known=known,
-            pool=opened.enter_context(RuntimePool()) if pool is None else pool,
-            options=options,
-            progress=progress,
-            judge=judge,
-            folder=Path(opened.enter_context(scratch_folder())),
-        )
+        matched = match_candidates(policy, reference, near, options.names)
+        used, known = chosen_runtimes(judging.runtimes, [m.format for m in matched])
+        _check_options(judging, policy, matched, used)
+        running = opened.enter_context(RuntimePool()) if pool is None else pool
+        session = Session(used, known, running, judging, progress)
+        comparison = _Comparison(policy, source, session, judge, Path(opened.enter_context(scratch_folder())))
         report = comparison.report(matched, rounded_to(reference))
     notes = [f"not compared, as {m.label} never had it: {', '.join(m.missing_ok)}" for m in matched if m.missing_ok]
     report = replace(report, notes=(*report.notes, *notes))
-    if report.passed is None and not report.undecided and not (allow_unverified or runtimes == "none"):
+    if report.passed is None and not report.undecided and not (options.allow_unverified or judging.runtimes == "none"):
         raise RuntimeUnavailableError(
             "no runtime that runs the candidates is installed, so nothing was compared",
             why=f"they are {', '.join(sorted({m.format.key for m in matched}))}",
@@ -120,16 +115,12 @@ def compare_artefacts(
     return report
 
 
-class _Comparison(Struct, frozen=True, kw_only=True):
+class _Comparison(Struct, frozen=True):
     """A reference, the runtimes that candidates run in, and what is made of them."""
 
     policy: Policy
     source: OriginalRun | None
-    runtimes: Sequence[str]
-    known: Sequence[RuntimeInfo]
-    pool: RuntimePool
-    options: VerifyOptions | None
-    progress: Progress
+    session: Session
     judge: Judge
     folder: Path
 
@@ -149,8 +140,7 @@ class _Comparison(Struct, frozen=True, kw_only=True):
             if storage is None:
                 reports.append(compared(tested))
             else:
-                rounded = (self.policy, storage, self.folder, compared, self.runtimes, self.pool, self.options)
-                reports.append(compare_rounded(tested, *rounded))
+                reports.append(compare_rounded(tested, self.policy, storage, self.folder, compared, self.session))
         return merge_reports(reports)
 
     def _compare(self, candidates: Sequence[tuple[Candidate, Path]], tested: PolicyUnderTest) -> ParityReport:
@@ -158,16 +148,16 @@ class _Comparison(Struct, frozen=True, kw_only=True):
             for candidate, copy in candidates:
                 yield from self._participants(candidate, copy, numpy_model, failure)
 
-        return self.judge(tested, self.runtimes, self.known, self.pool, self.options, self.progress, taking_part)
+        return self.judge(tested, self.session, taking_part)
 
     def _participants(
         self, candidate: Candidate, path: Path, numpy_model: LoadedModel, failure: Failure
     ) -> Iterator[Participant]:
         """The candidate in each runtime that runs its format; what does not load or fit goes to ``failure``."""
-        chosen = [r for r in candidate.format.runtimes if r in self.runtimes and r != "numpy"]
+        chosen = [r for r in candidate.format.runtimes if r in self.session.runtimes and r != "numpy"]
         for runtime in chosen:
             again = loading(runtime, path, candidate.ports.options, partial(_run_renamed, candidate))
-            for model, run in load_model(again, self.pool, partial(_not_loaded, candidate, failure, runtime)):
+            for model, run in load_model(again, self.session.pool, partial(_not_loaded, candidate, failure, runtime)):
                 blocked = any(p.blocking for p in candidate.problems)
                 hints = {} if blocked else _same_numbers(candidate, self.policy, numpy_model, model)
                 _misfits(candidate, failure, runtime, hints)

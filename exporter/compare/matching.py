@@ -207,7 +207,17 @@ def _match(
             text = f"it takes an input {port.name!r} that is not in the reference"
             problems.append(Problem(port.name, text, blocking=True))
     outputs = {n: p.name for n, p in found.items()}
-    return Candidate(label, kind, own, inputs, outputs, constant, drawn, tuple(problems), missing_ok)
+    return Candidate(
+        label=label,
+        format=kind,
+        ports=own,
+        inputs=inputs,
+        outputs=outputs,
+        constant=constant,
+        drawn=drawn,
+        problems=tuple(problems),
+        missing_ok=missing_ok,
+    )
 
 
 def _names(ports: Sequence[Port]) -> str:

@@ -4,7 +4,7 @@ weights rounded alike by numbers, and against the reference itself by what they 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from msgspec.structs import replace
@@ -12,12 +12,11 @@ from msgspec.structs import replace
 from converters.compiler.passes.weights import Storage, round_weights
 from converters.formats.bundle.bundle import Bundle
 from converters.policy.policy import Policy
-from converters.runtimes.pool import RuntimePool
 from exporter.export.options import storage_of
 from exporter.verify.checks.decisions import decisions
-from exporter.verify.options import VerifyOptions
 from exporter.verify.participants import PolicyUnderTest, write_reference
 from exporter.verify.report import ParityReport
+from exporter.verify.session import Session
 from signatures.contract import POLICY
 
 
@@ -36,9 +35,7 @@ def compare_rounded(
     storage: Storage,
     folder: Path,
     run: Callable[[PolicyUnderTest], ParityReport],
-    runtimes: Sequence[str],
-    pool: RuntimePool,
-    options: VerifyOptions | None,
+    session: Session,
 ) -> ParityReport:
     """Return the report of ``run`` on the policy with its weights rounded, with what rounding changes of its decisions.
 
@@ -48,8 +45,8 @@ def compare_rounded(
     reference = write_reference(small_policy, folder, f"reference-{storage}")
     small = replace(tested, graph=small_policy.graph, reference=reference, source=None)
     report = run(small)
-    found = decisions(tested, small, storage, runtimes, pool, options or VerifyOptions())
-    ran = tested.source.runtime if found and tested.source and tested.source.runtime in runtimes else None
+    found = decisions(tested, small, storage, session)
+    ran = tested.source.runtime if found and tested.source and tested.source.runtime in session.runtimes else None
     note = f"weights in {storage}: numbers were compared with the reference's weights rounded alike, decisions with it"
     return replace(report.with_findings(found), notes=(*report.notes, note), self_consistent=False, original=ran)
 

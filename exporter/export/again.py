@@ -30,6 +30,7 @@ from exporter.verify.checks.decisions import decisions
 from exporter.verify.options import VerifyOptions
 from exporter.verify.participants import policy_under_test, write_reference
 from exporter.verify.report import ParityReport
+from exporter.verify.session import Session
 from exporter.verify.verification import verify
 from signatures.code import CodeOptions
 from signatures.contract import POLICY, Contract, safe_name
@@ -233,14 +234,15 @@ def _run(
         weights = found.contract.tool.get("weights")
         # What was rounded is held against itself; the source is asked what it decides.
         held = replace(tested, source=None) if weights else tested
-        report = verify(held, () if case.asked else running, known, pool, options, progress)
+        session = Session(() if case.asked else running, known, pool, options or VerifyOptions(), progress)
+        report = verify(held, session)
         if weights and given.original is not None:
-            decided = decisions(tested, held, storage_of(weights), running, pool, options or VerifyOptions())
+            decided = decisions(tested, held, storage_of(weights), replace(session, runtimes=running))
             ran = given.original.runtime if decided and given.original.runtime in used else None
             report = replace(report.with_findings(decided), self_consistent=False, original=ran)
         if again is not None and again.own is not None:
             under = own_in(again, case.formats, scratch / "own")
-            other = verify(under, running, known, pool, None, progress)
+            other = verify(under, Session(running, known, pool, progress=progress))
             report = join_reports(report, other, BEFORE_BAKE if again.bake else UNDER_OWN_NAMES)
     return report
 

@@ -64,13 +64,13 @@ def artefacts_of(
         contract = contract_of(
             job.policy,
             job.source,
-            job.model,
-            options.read,
-            None if job.profile is None else job.profile.name,
-            None if job.whole is None else options.weights,
-            job.batch,
-            options.code,
-            job.bake,
+            model=job.model,
+            read=options.read,
+            profile=None if job.profile is None else job.profile.name,
+            weights=None if job.whole is None else options.weights,
+            batch=job.batch,
+            code=options.code,
+            bake=job.bake,
         )
         if job.profile is None:
             how = WriteOptions(

@@ -221,23 +221,25 @@ class Exporter:
         ):
             report = None
             if self.runtimes:
+                from exporter.verify.session import Session
                 from exporter.verify.verification import verify
 
                 assert pool is not None, "runtimes run in processes"
                 tested = under_test(job, stage, artifacts, folder)
-                rules = replace(options.parity, rules=(), golden=None, budget={}, require=())
-                report = verify(tested, self.runtimes, self._known, pool, options.parity, progress)
+                session = Session(self.runtimes, self._known, pool, options.parity, progress)
+                beside = replace(session, options=replace(options.parity, rules=(), golden=None, budget={}, require=()))
+                report = verify(tested, session)
                 if job.own is not None:
                     under = own_in(job, self._formats, folder / "own")
-                    other = verify(under, self.runtimes, self._known, pool, rules, progress)
+                    other = verify(under, beside)
                     report = join_reports(report, other, BEFORE_BAKE if job.bake else UNDER_OWN_NAMES)
                 if job.whole is not None:
                     from exporter.verify.checks.decisions import decisions
 
                     whole = under_test(replace(job, policy=job.whole, whole=None), stage, (), folder / "whole")
-                    own = verify(whole, self.runtimes, self._known, pool, rules, progress)
+                    own = verify(whole, beside)
                     report = join_reports(report, own, "the policy with its weights as they were, by the numpy kernels")
-                    found = decisions(whole, tested, options.weights, self.runtimes, pool, options.parity)
+                    found = decisions(whole, tested, options.weights, session)
                     report = replace(report.with_findings(found), whole_sizes=whole_sizes)
                 with bundle.writing(out):
                     (stage / PARITY).write_bytes(bundle.dumps(report.to_dict()))

@@ -97,15 +97,15 @@ def _to_written(result: ExportResult, wanted: Wanted, steps: int) -> Written:
     signature, report = result.policy.signature, result.report
     failures = [] if report is None else report.failures
     return Written(
-        result.policy.name,
-        result.folder,
-        result.passed,
-        f"{signature.family}, {signature.action_space} actions",
-        result.renamed,
-        failures[0].sentence() if failures else None,
-        "" if report is None else report.undecided,
-        result.to_dict() if wanted.answers else None,
-        of_result(result, steps) if wanted.entries else None,
+        name=result.policy.name,
+        folder=result.folder,
+        passed=result.passed,
+        what=f"{signature.family}, {signature.action_space} actions",
+        renamed=result.renamed,
+        failure=failures[0].sentence() if failures else None,
+        undecided="" if report is None else report.undecided,
+        answer=result.to_dict() if wanted.answers else None,
+        entry=of_result(result, steps) if wanted.entries else None,
     )
 
 

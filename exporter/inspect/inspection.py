@@ -160,7 +160,17 @@ def inspect_source(
         parameters = sum(v.size for v in policy.graph.values() if v.ndim and v.dtype.kind == "f")
         decisions = decided.get(policy.name, ())
         board = None if targets[LITERT.key] is not None else _board(source.path, policy)
-        found.append(PolicyInspection(policy, ops, targets, parameters, layers, decisions, board))
+        found.append(
+            PolicyInspection(
+                policy=policy,
+                ops=ops,
+                targets=targets,
+                parameters=parameters,
+                layers=layers,
+                decisions=decisions,
+                board=board,
+            )
+        )
     return Inspection(
         path=source.path,
         kind=source.format.label,

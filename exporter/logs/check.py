@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -105,20 +106,21 @@ def check_log(policy: LoadedPolicy, path: Path, tolerance: Tolerance = LOG_TOLER
     wanted = [n for t in targets for n in t.output_names] + ([pair[1]] if pair else [])
     replay = Replay(policy.run, signature, tuple(dict.fromkeys(wanted)))
     plain = Trials(replay, recording, targets, tolerance, drawn=False)
+    report = partial(_report, policy, path, recording, targets, tolerance)
     base = plain.verdict()
     if base.fits:
-        return _report(policy, path, recording, targets, tolerance, base, None, drawn=False)
+        return report(base, None, drawn=False)
     drawn = Trials(replay, recording, targets, tolerance, drawn=True)
     found = explain(plain, base)
     as_drawn = drawn.verdict()
     if (found is None or not found.whole) and drawn.drawn:
         by_chance = explain(drawn, as_drawn)
         if by_chance is None and as_drawn.fits:
-            return _report(policy, path, recording, targets, tolerance, as_drawn, None, drawn=True)
+            return report(as_drawn, None, drawn=True)
         if by_chance is not None and (by_chance.whole or found is None):
-            return _report(policy, path, recording, targets, tolerance, as_drawn, by_chance, drawn=True)
+            return report(as_drawn, by_chance, drawn=True)
         found = found or explain(plain, base, LEAST)
-    return _report(policy, path, recording, targets, tolerance, base, found, drawn=False)
+    return report(base, found, drawn=False)
 
 
 def _check_drawable(path: Path, policy: LoadedPolicy, targets: list[Target]) -> None:

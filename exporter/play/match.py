@@ -13,8 +13,6 @@ from converters.files.children.process import RunFailedError
 from converters.formats.bundle.embed import runnable
 from converters.graph.run import run_graph
 from converters.policy.policy import Policy
-from converters.runtimes.pool import RuntimePool
-from converters.runtimes.registry import RuntimeInfo
 from exporter.acting.policy import LoadedPolicy
 from exporter.play.episodes import Episodes, Watch, play_episodes, turn_seed
 from exporter.play.equivalence import CONFIDENCE, DIFFERENT, EQUIVALENT, Equivalence, equivalence
@@ -24,10 +22,10 @@ from exporter.play.replay import replay
 from exporter.play.worlds import MakeWorld
 from exporter.verify.checks.rollout import rollout
 from exporter.verify.findings import Finding
-from exporter.verify.options import VerifyOptions
 from exporter.verify.participants import Participant, PolicyUnderTest
 from exporter.verify.reference import Reference
 from exporter.verify.report import ParityReport
+from exporter.verify.session import Session
 from exporter.verify.trial import Inputs, Trial
 from exporter.verify.verification import Participants, verify
 from signatures.batches import Arrays, Run
@@ -103,22 +101,17 @@ class Match:
     def judge(
         self,
         tested: PolicyUnderTest,
-        runtimes: Sequence[str],
-        known: Sequence[RuntimeInfo],
-        pool: RuntimePool,
-        options: VerifyOptions | None,
-        progress: Progress,
+        session: Session,
         participants: Participants | None,
     ) -> ParityReport:
         """Return the report on the replay; what was played is kept here."""
-        self._progress = progress
-        options = options or VerifyOptions(seed=self._options.seed)
+        self._progress = session.progress
 
         def record(reference: Reference) -> Inputs:
             return self._record(tested, reference)
 
         checks = (replay, rollout, self._play)
-        return verify(tested, runtimes, known, pool, options, progress, participants, record, checks)
+        return verify(tested, session, participants, record, checks)
 
     def _record(self, tested: PolicyUnderTest, reference: Reference) -> Inputs:
         """Have the reference play, and keep what it met."""

@@ -15,7 +15,7 @@ from converters.files.folders import scratch_folder
 from converters.formats.bundle.bundle import Bundle
 from converters.formats.source import ReadOptions
 from converters.runtimes.pool import RuntimePool
-from exporter.compare.comparison import compare_artefacts
+from exporter.compare.comparison import CompareOptions, compare_artefacts
 from exporter.export.options import ExportOptions
 from exporter.export.pipeline import export
 from exporter.play.match import Match
@@ -73,11 +73,12 @@ def play_policy(
         report = compare_artefacts(
             first,
             others,
-            names=names,
-            runtimes=judging.runtimes,
-            options=replace(judging, seed=options.seed),
-            understanding=understanding,
-            read=read,
+            CompareOptions(
+                names=names or {},
+                judging=replace(judging, seed=options.seed),
+                understanding=understanding,
+                read=read,
+            ),
             progress=progress,
             understood=match.take_policy,
             pool=pool,

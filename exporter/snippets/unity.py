@@ -20,23 +20,23 @@ class Generation(Struct, frozen=True):
     """A span of ML-Agents versions and what its brain can do with a graph."""
 
     name: str
-    memory: bool
-    previous_rank: int | None
-    masks: bool
-    branches: bool
-    #: whether it feeds sequence_length and reads memory_size wherever there is a memory
-    asks: bool
     vector_field: str
     observation_field: str
+    memory: bool = True
+    previous_rank: int | None = None
+    masks: bool = False
+    branches: bool = False
+    #: whether it feeds sequence_length and reads memory_size wherever there is a memory
+    asks: bool = False
 
 
+_STATE = ("State Node Name", "Observation Placeholder Name")
+_VECTOR = ("Vector Observation Node Name", "Visual Observation Placeholder Name")
 _INTERNAL = (
-    Generation("0.1", False, None, False, False, False, "State Node Name", "Observation Placeholder Name"),
-    Generation("0.2", True, None, False, False, False, "State Node Name", "Observation Placeholder Name"),
-    Generation(
-        "0.3-0.4", True, 1, False, False, True, "Vector Observation Node Name", "Visual Observation Placeholder Name"
-    ),
-    Generation("0.5", True, 2, True, True, True, "Vector Observation Node Name", "Visual Observation Placeholder Name"),
+    Generation("0.1", *_STATE, memory=False),
+    Generation("0.2", *_STATE),
+    Generation("0.3-0.4", *_VECTOR, previous_rank=1, asks=True),
+    Generation("0.5", *_VECTOR, previous_rank=2, masks=True, branches=True, asks=True),
 )
 _FIXED = ("vector_observation", "prev_action", "epsilon", "action_masks", "recurrent_in")
 _NEEDED = (VERSION_NUMBER, IS_CONTINUOUS, MEMORY_SIZE, ACTION_SHAPE)

@@ -220,7 +220,9 @@ class _Search(Struct, frozen=True, eq=False):
             if difference.passed:
                 return None
         hidden = tuple(r for r in dict.fromkeys(node.inputs) if r not in seen and not self._is_setting(r))
-        return _bisection_at(node, tensor, expected, got, difference, self.source, hidden)
+        return _bisection_at(
+            node, tensor, expected=expected, got=got, difference=difference, source=self.source, hidden=hidden
+        )
 
     def _is_setting(self, tensor: str) -> bool:
         """An axis, a shape: other formats have it as an attribute."""

@@ -290,7 +290,17 @@ def failure(kind: str, runtime: str, error: RunFailedError, output: str = "*") -
     """What a runtime said when it gave no answer."""
     text = error.what if error.why is None else f"{error.what}: {error.why}"
     infinite = float("inf")
-    return Failure(kind, runtime, output, infinite, infinite, Tolerance(), False, None, text.strip())
+    return Failure(
+        format=kind,
+        runtime=runtime,
+        output=output,
+        max_abs_diff=infinite,
+        max_rel_diff=infinite,
+        tolerance=Tolerance(),
+        passed=False,
+        worst_input=None,
+        reason=text.strip(),
+    )
 
 
 def undecided_reference(kind: str, runtime: str, error: RunFailedError) -> Undecided:
@@ -302,7 +312,17 @@ def undecided_reference(kind: str, runtime: str, error: RunFailedError) -> Undec
 def undecided_finding(kind: str, runtime: str, output: str, reason: str, where: str | None = None) -> Undecided:
     """What could not be compared, and why."""
     infinite = float("inf")
-    return Undecided(kind, runtime, output, infinite, infinite, Tolerance(), False, where, reason)
+    return Undecided(
+        format=kind,
+        runtime=runtime,
+        output=output,
+        max_abs_diff=infinite,
+        max_rel_diff=infinite,
+        tolerance=Tolerance(),
+        passed=False,
+        worst_input=where,
+        reason=reason,
+    )
 
 
 def share_text(share: float) -> str:

@@ -240,22 +240,22 @@ class Trial:
     ) -> Finding:
         """What a check says, from the difference that it found."""
         return kind(
-            participant.name,
-            participant.runtime,
-            output,
-            difference.max_abs,
-            difference.max_rel,
-            self._judged_by(output, participant, difference),
-            difference.passed,
-            where,
-            difference.reason,
-            drift,
-            difference.rounding,
-            difference.histogram,
-            None if difference.passed else difference.smallest_tolerance,
-            bisection,
-            "numpy" if output in self._apart and kind is not Shape else "",
-            difference.share,
+            format=participant.name,
+            runtime=participant.runtime,
+            output=output,
+            max_abs_diff=difference.max_abs,
+            max_rel_diff=difference.max_rel,
+            tolerance=self._judged_by(output, participant, difference),
+            passed=difference.passed,
+            worst_input=where,
+            reason=difference.reason,
+            drift=drift,
+            rounding=difference.rounding,
+            histogram=difference.histogram,
+            smallest_tolerance=None if difference.passed else difference.smallest_tolerance,
+            bisection=bisection,
+            against="numpy" if output in self._apart and kind is not Shape else "",
+            share=difference.share,
         )
 
     def _judged_by(self, output: str, participant: Participant, difference: Difference) -> Tolerance:

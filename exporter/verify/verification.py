@@ -7,8 +7,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from msgspec.structs import replace
 
 from converters.files.children.process import LoadedModel, RunFailedError
-from converters.runtimes.pool import FIXED, INDEPENDENT, RuntimePool
-from converters.runtimes.registry import RuntimeInfo
+from converters.runtimes.pool import FIXED, INDEPENDENT
 from exporter.verify.checks.consumer import consumers
 from exporter.verify.checks.densities import densities
 from exporter.verify.checks.draws import draws
@@ -17,7 +16,6 @@ from exporter.verify.checks.numbers import check_recording, numbers
 from exporter.verify.checks.rollout import rollout
 from exporter.verify.checks.size import check_budget, sizes
 from exporter.verify.findings import Finding, failure, undecided_finding, undecided_reference
-from exporter.verify.options import VerifyOptions
 from exporter.verify.participants import (
     Failure,
     Participant,
@@ -28,24 +26,14 @@ from exporter.verify.participants import (
 )
 from exporter.verify.reference import Reference
 from exporter.verify.report import ParityReport
+from exporter.verify.session import Session
 from exporter.verify.trial import Inputs, Trial
 from exporter.verify.verdict import key_of, required_reason
 
 #: Who takes part beside the reference: given the numpy reference and where failures go.
 Participants = Callable[[LoadedModel, Failure], Iterable[Participant]]
 #: What is made of participants: ``verify``, or something with its first parameters.
-Judge = Callable[
-    [
-        PolicyUnderTest,
-        Sequence[str],
-        Sequence[RuntimeInfo],
-        RuntimePool,
-        VerifyOptions | None,
-        Callable[[str], None],
-        Participants | None,
-    ],
-    ParityReport,
-]
+Judge = Callable[[PolicyUnderTest, Session, Participants | None], ParityReport]
 Check = Callable[[Trial, Participant], Iterator[Finding]]
 #: What each participant is put through, one after the other.
 CHECKS: tuple[Check, ...] = (numbers, rollout, draws, densities)
@@ -53,11 +41,7 @@ CHECKS: tuple[Check, ...] = (numbers, rollout, draws, densities)
 
 def verify(
     tested: PolicyUnderTest,
-    runtimes: Sequence[str],
-    known: Iterable[RuntimeInfo],
-    pool: RuntimePool,
-    options: VerifyOptions | None = None,
-    progress: Callable[[str], None] = lambda text: None,
+    session: Session,
     participants: Participants | None = None,
     inputs: Callable[[Reference], Inputs] | None = None,
     checks: Sequence[Check] = CHECKS,
@@ -68,26 +52,24 @@ def verify(
     gives what is asked in place of inputs that are drawn, ``checks`` what each participant is put through. Raises
     UsageError, before anything runs, where an option does not fit the policy.
     """
-    options = options or VerifyOptions()
-    check_budget(options.budget, tested.sizes)
-    trial = Trial(tested, pool, options)
+    check_budget(session.options.budget, tested.sizes)
+    trial = Trial(tested, session.pool, session.options)
     reference, findings, notes = "none", list[Finding](), list[str]()
-    if runtimes:
-        progress(f"{tested.name}: starting the runtimes, running the source")
-        pool.start(needed_runtimes(tested, runtimes))
-        with Reference(tested, runtimes, pool, options.seed) as answering:
+    if session.runtimes:
+        session.progress(f"{tested.name}: starting the runtimes, running the source")
+        session.pool.start(needed_runtimes(tested, session.runtimes))
+        with Reference(tested, session.runtimes, session.pool, session.options.seed) as answering:
             reference = answering.name
-            findings += _findings(trial, answering, runtimes, progress, participants, inputs, checks)
+            findings += _findings(trial, answering, session, participants, inputs, checks)
         notes = trial.notes()
     findings += consumers(tested.profile, tested.files, memory=tested.signature.memory is not None)
-    return _report(trial, reference, runtimes, known, in_order(findings, tested), notes)
+    return _report(trial, reference, session, in_order(findings, tested), notes)
 
 
 def _findings(
     trial: Trial,
     reference: Reference,
-    runtimes: Sequence[str],
-    progress: Callable[[str], None],
+    session: Session,
     participants: Participants | None,
     inputs: Callable[[Reference], Inputs] | None,
     checks: Sequence[Check],
@@ -110,11 +92,11 @@ def _findings(
 
     taking_part: Iterable[Participant]
     if participants is None:
-        taking_part = participants_of(trial.tested, runtimes, trial.pool, reference, add_failure)
+        taking_part = participants_of(trial.tested, session.runtimes, trial.pool, reference, add_failure)
     else:
         taking_part = participants(reference.model, add_failure)
     for participant in taking_part:
-        progress(f"{trial.tested.name}: {participant.name} in {participant.runtime}")
+        session.progress(f"{trial.tested.name}: {participant.name} in {participant.runtime}")
         try:
             for check in checks:
                 findings += check(trial, participant)
@@ -128,20 +110,19 @@ def _findings(
 def _report(
     trial: Trial,
     reference: str,
-    runtimes: Sequence[str],
-    known: Iterable[RuntimeInfo],
+    session: Session,
     findings: Sequence[Finding],
     notes: Sequence[str],
 ) -> ParityReport:
-    tested, options = trial.tested, trial.options
+    tested, options = trial.tested, session.options
     versions = trial.pool.versions()
     tried = {f.runtime for f in findings}  # one that died has no version any more, but it ran
     states: dict[str, dict[str, str | None]] = {}
-    for info in known:
+    for info in session.known:
         unfit = info.name in FIXED and tested.batch is None
-        ran = info.name in runtimes and (info.name in versions or info.name in tried) and not unfit
+        ran = info.name in session.runtimes and (info.name in versions or info.name in tried) and not unfit
         reason = None if ran else "not asked for" if info.installed else f"not installed; {info.how}"
-        if unfit and info.name in runtimes:
+        if unfit and info.name in session.runtimes:
             reason = "takes files for a fixed number of agents alone (--batch)"
         states[info.name] = {
             "version": versions.get(info.name, info.version),

@@ -18,7 +18,6 @@ from converters.formats.format import Ports
 from converters.formats.frozen_graph.tensors import from_array, to_array
 from converters.formats.registry import WRITTEN
 from converters.runtimes.pool import RuntimePool
-from exporter.compare.comparison import compare_artefacts
 from exporter.compare.matching import labels_of
 from exporter.export.pipeline import ExportOptions, export
 from exporter.verify.findings import Finding
@@ -26,6 +25,7 @@ from exporter.verify.report import ParityReport
 from fixtures import path as fixture
 from signatures.errors import RuntimeUnavailableError, UsageError
 from tests.commands import export_model, is_refused
+from tests.comparing import compare_artefacts
 
 RUNTIMES = "tensorflow,onnxruntime,tfjs-cpu"
 

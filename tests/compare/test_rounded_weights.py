@@ -11,11 +11,11 @@ from onnx import numpy_helper
 
 from converters.compiler.passes.weights import Storage
 from converters.runtimes.pool import RuntimePool
-from exporter.compare.comparison import compare_artefacts
 from exporter.compare.weights import rounded_to
 from exporter.export.again import verify_folder
 from exporter.export.pipeline import ExportOptions, export
 from fixtures import path as fixture
+from tests.comparing import compare_artefacts
 from tests.faults.artefacts import opened
 
 RUNTIMES = "onnxruntime,tensorflow"

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import ast
 import textwrap
 
 import pytest
 
 from tests.function_sizes import complexity, functions, is_table, own_lines
+from tests.positional_arguments import long_calls, name_of, of_any_number
 
 OUTER = """
 def outer(x):
@@ -40,3 +42,14 @@ def test_a_function_is_measured_without_its_docstring_and_what_is_inside_of_it()
 def test_a_table_only_gives_and_names_values(body: str, table: bool) -> None:
     (function,) = functions(f"def rows():\n{textwrap.indent(body, '    ')}")
     assert is_table(function) is table
+
+
+def test_arguments_by_place_are_counted_but_for_functions_of_any_number() -> None:
+    tree = ast.parse(
+        "def element(tag, *children): ...\n"
+        "element(1, 2, 3, 4, 5, 6, 7)\n"
+        "Layer(1, 2, 3, 4, 5, 6, 7)\n"
+        "nn.lstm(1, 2, 3, 4, 5, 6, 7, gates=8)\n"
+        "Layer(1, 2, 3, 4, 5, 6, axis=7)\n"
+    )
+    assert [name_of(call.func) for call in long_calls(tree, of_any_number([tree]))] == ["Layer", "lstm"]

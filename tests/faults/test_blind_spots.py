@@ -25,6 +25,7 @@ from exporter.verify.checks.draws import least_likely, repeats, with_zeros
 from exporter.verify.options import VerifyOptions
 from exporter.verify.participants import Feeds, Participant, policy_under_test
 from exporter.verify.report import ParityReport
+from exporter.verify.session import Session
 from exporter.verify.statistics import FALSE_ALARM
 from exporter.verify.tolerances import Tolerance
 from exporter.verify.verification import verify
@@ -62,7 +63,7 @@ def verified(
         outputs = [s.name for s in policy.signature.outputs]
         yield Participant(format="onnx", runtime="onnxruntime", run=run, outputs=outputs, model=numpy)
 
-    return verify(tested, ("numpy", "onnxruntime"), KNOWN, pool, options or VerifyOptions(), participants=participants)
+    return verify(tested, Session(("numpy", "onnxruntime"), KNOWN, pool, options or VerifyOptions()), participants)
 
 
 def honest(feeds: Feeds, answers: Arrays) -> Arrays:

@@ -12,12 +12,12 @@ from onnx import helper, numpy_helper
 
 from converters.compiler.options import CompileOptions
 from converters.runtimes.pool import RuntimePool
-from exporter.compare.comparison import compare_artefacts
 from exporter.export.again import verify_folder
 from exporter.export.pipeline import ExportOptions, export
 from exporter.verify.options import VerifyOptions
 from exporter.verify.participants import Feeds
 from exporter.verify.report import ParityReport
+from tests.comparing import compare_artefacts
 from tests.faults.artefacts import opened
 from tests.faults.test_blind_spots import Arrays, verified
 from tests.handmade import constant, dense, graph_bytes, node, placeholder

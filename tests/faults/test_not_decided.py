@@ -11,7 +11,6 @@ import pytest
 from converters.files import tensorflow_messages as schema
 from converters.files.children.process import RunFailedError
 from converters.runtimes.pool import RuntimePool
-from exporter.compare.comparison import compare_artefacts
 from exporter.export.again import verify_folder
 from exporter.export.pipeline import ExportOptions, export
 from exporter.verify.difference import compare, compare_all
@@ -19,6 +18,7 @@ from exporter.verify.participants import Feeds
 from exporter.verify.reference import Reference
 from exporter.verify.tolerances import Tolerance
 from tests.commands import export_model
+from tests.comparing import compare_artefacts
 from tests.exporter.test_what_is_compared import _epsilon_greedy
 from tests.faults.test_blind_spots import Arrays, honest, verified
 from tests.handmade import constant, graph_bytes, node, placeholder

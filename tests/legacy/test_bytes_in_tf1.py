@@ -23,6 +23,7 @@ from converters.runtimes.tensorflow1.release import RELEASES
 from exporter.export.pipeline import ExportOptions, ExportResult, export
 from exporter.verify.findings import Finding
 from exporter.verify.participants import PolicyUnderTest
+from exporter.verify.session import Session
 from exporter.verify.verification import verify
 from fixtures import FIXTURES, path
 from fixtures.goldens import read_npz
@@ -63,7 +64,7 @@ def compared(result: ExportResult, legacy: Sequence[str], pool: RuntimePool) -> 
         sizes=result.sizes,
         reference=file,
     )
-    report = verify(tested, ("numpy", *legacy), (), pool)
+    report = verify(tested, Session(("numpy", *legacy), (), pool))
     return [c for c in report.comparisons if c.runtime in legacy]
 
 

@@ -20,7 +20,6 @@ from converters.graph.ops.table import TABLE
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.registry import available_runtimes
 from exporter.api import verify_bundle
-from exporter.compare.comparison import compare_artefacts
 from exporter.export.pipeline import ExportOptions, ExportResult, export
 from exporter.export.sources import read_source
 from exporter.reports.summary import failure_lines
@@ -29,6 +28,7 @@ from fixtures import FIXTURES, path
 from signatures.contract import parse
 from signatures.errors import UnsupportedOpError
 from tests import known
+from tests.comparing import compare_artefacts
 from tests.conftest import Chosen
 from tests.graph.harness import policy_of
 from tests.graph.making import const, graph, node, placeholder

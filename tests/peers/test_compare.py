@@ -12,9 +12,9 @@ import pytest
 from converters.formats.frozen_graph.encode import encode
 from converters.graph.nodes import Graph, Node, TensorShape
 from converters.runtimes.pool import RuntimePool
-from exporter.compare.comparison import compare_artefacts
 from exporter.export.pipeline import ExportResult
 from signatures.roles import Role
+from tests.comparing import compare_artefacts
 from tests.peers.agreement import POLICIES
 from tests.peers.conftest import Theirs
 from tests.peers.environment import Peers

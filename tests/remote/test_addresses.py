@@ -12,7 +12,6 @@ import pytest
 
 from converters.files import fetch
 from exporter import export_model, inspect_model, verify_bundle
-from exporter.compare.comparison import compare_artefacts
 from exporter.export.pipeline import ExportOptions
 from exporter.fleet.fleet import export_fleet
 from exporter.fleet.sources import sources_in
@@ -23,6 +22,7 @@ from exporter.remote.filesystem import remote
 from fixtures import path as fixture
 from signatures.contract import POLICY
 from signatures.errors import BundleError, SourceError, UsageError
+from tests.comparing import compare_artefacts
 
 fsspec = pytest.importorskip("fsspec")
 

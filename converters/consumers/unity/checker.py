@@ -171,7 +171,9 @@ def check_onnx(file: OnnxFile, path: Path, consumer: Consumer, brain: Brain | No
         model = barracuda_model.of_onnx(file, consumer)
     else:
         model = sentis_model.of_onnx(file, consumer)
-    return _verdict_on_import(path, consumer, brain, model, onnx_ranks(file, model), file, wrong)
+    return _verdict_on_import(
+        path, consumer, brain=brain, model=model, ranks=onnx_ranks(file, model), file=file, wrong=wrong
+    )
 
 
 def _check_nn_file(path: Path, consumer: Consumer, brain: Brain | None) -> UnityVerdict:

@@ -147,7 +147,9 @@ def constructs(proto: Any) -> Model:
     for value in graph.input:
         if value.name not in values:
             model.inputs[value.name] = Operand(value.name, Source.INPUT, *_type_of(onnx, value.type.tensor_type))
-            model.add(Construct(value.name, INPUT, opset, (), {}, (value.name,), model))
+            model.add(
+                Construct(value.name, INPUT, opset, operands=(), attributes={}, outputs=(value.name,), model=model)
+            )
     model.outputs = {
         v.name: Operand(v.name, Source.COMPUTED, *_type_of(onnx, v.type.tensor_type)) for v in graph.output
     }
@@ -158,9 +160,10 @@ def constructs(proto: Any) -> Model:
         operands = tuple(operand(name) for name in node.input)
         op = node.op_type if node.domain in _STANDARD else f"{node.domain}.{node.op_type}"
         name = node.name or node.output[0]
-        model.add(Construct(name, op, opset, operands, attributes, tuple(n for n in node.output if n), model))
+        given = tuple(n for n in node.output if n)
+        model.add(Construct(name, op, opset, operands, attributes, given, model=model))
     for name in model.outputs:
-        model.add(Construct(name, OUTPUT, opset, (operand(name),), {}, (), model))
+        model.add(Construct(name, OUTPUT, opset, (operand(name),), attributes={}, outputs=(), model=model))
     return model
 
 

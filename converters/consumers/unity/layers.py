@@ -73,21 +73,22 @@ def _off_size(layer: Layer, model: NnModel) -> str:
 
 _ROWS = (
     LayerRow(
-        frozenset({"1.0.8", "1.9.1", "2.0.1"}),
-        Outcome.FIRST,
-        _is_flatten_in_need,
-        "Barracuda before 2.3 leaves a Flatten out, and what reads it gets the axes before it",
-        "write a Reshape to [-1, 1, 1, C] in its place; --for {profile} does, or write the .onnx",
-        "cases/recurrent_nn_barracuda-1.4; cases/other_nn_barracuda-1.0",
-        _off_shape,
+        consumers=frozenset({"1.0.8", "1.9.1", "2.0.1"}),
+        outcome=Outcome.FIRST,
+        when=_is_flatten_in_need,
+        says="Barracuda before 2.3 leaves a Flatten out, and what reads it gets the axes before it",
+        fix="write a Reshape to [-1, 1, 1, C] in its place; --for {profile} does, or write the .onnx",
+        evidence="cases/recurrent_nn_barracuda-1.4; cases/other_nn_barracuda-1.0",
+        exception=_off_shape,
     ),
     LayerRow(
-        frozenset({"1.0.8", "1.9.1"}),
-        Outcome.FIRST,
-        _is_reshape_of_memory,
-        "in a file with one input Barracuda 1.x looks at shapes before it knows the memories': a Reshape of one fails",
-        "cut the memory as it is, along C; --for {profile} does",
-        "cases/other_nn_barracuda-1.0",
-        _off_size,
+        consumers=frozenset({"1.0.8", "1.9.1"}),
+        outcome=Outcome.FIRST,
+        when=_is_reshape_of_memory,
+        says="in a file with one input Barracuda 1.x looks at shapes before it knows the memories':"
+        " a Reshape of one fails",
+        fix="cut the memory as it is, along C; --for {profile} does",
+        evidence="cases/other_nn_barracuda-1.0",
+        exception=_off_size,
     ),
 )

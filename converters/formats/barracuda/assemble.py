@@ -41,10 +41,19 @@ def assemble(
             offset += array.size
         layers.append(
             Layer(
-                draft.name, int(draft.type), int(draft.activation), draft.pad, draft.stride, draft.pool, draft.axis,
-                draft.alpha, draft.beta, draft.inputs, tuple(datasets),
+                name=draft.name,
+                type=int(draft.type),
+                activation=int(draft.activation),
+                pad=draft.pad,
+                stride=draft.stride,
+                pool=draft.pool,
+                axis=draft.axis,
+                alpha=draft.alpha,
+                beta=draft.beta,
+                inputs=draft.inputs,
+                datasets=tuple(datasets),
             )
-        )  # fmt: skip
+        )
     return NnModel(
         VERSION,
         tuple(inputs),  # those too that no layer reads (of a policy with a single action): Unity looks for them

@@ -209,7 +209,19 @@ class _Parser:
         self._ints()  # a third
         inputs = self._list(f"inputs of layer {name!r}", 4, self._text)
         datasets = self._list(f"datasets of layer {name!r}", 24, self._dataset)
-        return Layer(name, kind, activation, pad, stride, pool, axis, alpha, beta, inputs, datasets)
+        return Layer(
+            name=name,
+            type=kind,
+            activation=activation,
+            pad=pad,
+            stride=stride,
+            pool=pool,
+            axis=axis,
+            alpha=alpha,
+            beta=beta,
+            inputs=inputs,
+            datasets=datasets,
+        )
 
     def _dataset(self) -> Dataset:
         name = self._text()

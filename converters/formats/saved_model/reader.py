@@ -65,7 +65,15 @@ def read_saved_model(data: bytes, key: str | None = None, detached: Detached | N
         signature = ModelSignature(_tensors(definition.inputs), _tensors(definition.outputs), key)
     calls = _calls_functions(meta.graph_def, signature)
     restore = meta.saver_def.restore_op_name
-    return Saved(meta.graph_def, tuple(meta.meta_info_def.tags), signature, keys, calls, restore, detached)
+    return Saved(
+        graph_def=meta.graph_def,
+        tags=tuple(meta.meta_info_def.tags),
+        signature=signature,
+        keys=keys,
+        calls=calls,
+        restore=restore,
+        detached=detached,
+    )
 
 
 def _tensors(entries: Mapping[str, Any]) -> dict[str, Tensor]:

@@ -120,7 +120,7 @@ class Network(Builder):
                 c = self.slice(memory, 1, (layers + layer) * hidden, (layers + layer + 1) * hidden)
                 product = self.add("MatMul", [x, self.const(kernel.T, "kernel")])
                 recurrent = self.const(inner.T, "recurrent_kernel")
-                x, cell = lstm(self, product, h, c, recurrent, biases[0] + biases[1], "ifgo")
+                x, cell = lstm(self, product, h=h, c=c, recurrent=recurrent, bias=biases[0] + biases[1], gates="ifgo")
                 after["c"].append(cell)
             else:
                 order = (1, 0, 2)  # PyTorch has r, z, n; the layer is given z, r, n

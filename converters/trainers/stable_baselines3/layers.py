@@ -38,4 +38,4 @@ def _batch_renorm(net: Network, x: str, module: str, epsilon: float) -> str:
     )
     net.state.forget(f"{module}.steps")
     with np.errstate(all="ignore"):  # a damaged file: verification finds it
-        return batch(net, x, scale, bias, mean, variance, epsilon)
+        return batch(net, x, scale=scale, bias=bias, mean=mean, variance=variance, epsilon=epsilon)

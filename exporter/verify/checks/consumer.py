@@ -58,7 +58,17 @@ def consumers(name: str | None, files: Mapping[str, Path], *, memory: bool = Fal
 
 def _finding(kind: type[Accepted], key: str, release: str, wrong: list[str]) -> Finding:
     reason = "; ".join(dict.fromkeys(wrong))[:600]
-    return kind(key, release, "*", 0.0, 0.0, Tolerance(0.0, 0.0), not wrong, None, reason)
+    return kind(
+        format=key,
+        runtime=release,
+        output="*",
+        max_abs_diff=0.0,
+        max_rel_diff=0.0,
+        tolerance=Tolerance(0.0, 0.0),
+        passed=not wrong,
+        worst_input=None,
+        reason=reason,
+    )
 
 
 def _import_faults(verdict: UnityVerdict) -> list[str]:

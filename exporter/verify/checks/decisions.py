@@ -15,11 +15,10 @@ import numpy as np
 
 from converters.compiler.passes.weights import Storage
 from converters.files.children.process import RunFailedError
-from converters.runtimes.pool import RuntimePool
 from exporter.verify.findings import Decisions, Finding, failure
-from exporter.verify.options import VerifyOptions
 from exporter.verify.participants import Feeds, PolicyUnderTest
 from exporter.verify.reference import Reference
+from exporter.verify.session import Session
 from exporter.verify.tolerances import Tolerance
 from signatures.roles import Role
 from signatures.sampling import Case, draw_typical
@@ -37,26 +36,25 @@ def decisions(
     whole: PolicyUnderTest,
     small: PolicyUnderTest,
     storage: Storage,
-    runtimes: Sequence[str],
-    pool: RuntimePool,
-    options: VerifyOptions,
+    session: Session,
 ) -> list[Finding]:
     """A finding for each action: ``small``, by the numpy kernels, beside ``whole``, by its source's runtime.
 
     Where both have the same graph (a bundle that is verified again), it is the source alone that says what was.
     """
     names = list(dict.fromkeys(_action_names(small.signature)))
+    seed = session.options.seed
     pairs: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
     try:
         with (
-            Reference(whole, runtimes, pool, options.seed) as before,
-            Reference(small, runtimes, pool, options.seed) as after,
+            Reference(whole, session.runtimes, session.pool, seed) as before,
+            Reference(small, session.runtimes, session.pool, seed) as after,
         ):
             again = whole.reference == small.reference
             if again and before.original is None:
                 return []
             ask = before.original.run if again and before.original is not None else partial(_one, before)
-            steps = draw_typical(small.signature, seed=options.seed, count=_CASES)
+            steps = draw_typical(small.signature, seed=seed, count=_CASES)
             sides = (_play_steps(small.signature, steps, each) for each in (ask, partial(_one, after)))
             for asked, given in zip(*sides, strict=True):
                 for name in names:
@@ -70,7 +68,19 @@ def decisions(
         was, made = (np.concatenate([answer[side] for answer in answers]) for side in (0, 1))
         off, said = compare_decisions(_choices(small.signature, name, was), _choices(small.signature, name, made))
         text = f"{said} {source}; {limit:.0%} is allowed"
-        found.append(Decisions("weights", storage, name, off, off, Tolerance(limit, 0.0), off <= limit, None, text))
+        found.append(
+            Decisions(
+                format="weights",
+                runtime=storage,
+                output=name,
+                max_abs_diff=off,
+                max_rel_diff=off,
+                tolerance=Tolerance(limit, 0.0),
+                passed=off <= limit,
+                worst_input=None,
+                reason=text,
+            )
+        )
     return found
 
 

@@ -45,7 +45,9 @@ def rollout(trial: Trial, participant: Participant) -> Iterator[Finding]:
             begins = trial.bisect(participant, output, steps[output][first], fed[first])
             begins = begins and replace(begins, input=where[first])
         drift = tuple(d.max_abs for d in differences)
-        yield trial.finding(Rollout, participant, name, difference, where[worst], drift, begins)
+        yield trial.finding(
+            Rollout, participant, output=name, difference=difference, where=where[worst], drift=drift, bisection=begins
+        )
 
 
 def _first(steps: Sequence[Difference]) -> int:

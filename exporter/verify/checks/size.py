@@ -53,4 +53,14 @@ def sizes(budget: Mapping[str, int], written: Mapping[str, int]) -> Iterator[Fin
         reason = "" if over <= 0 else f"{size_text(found[name])}, and the budget is {size_text(most)}"
         excess = float(max(over, 0))
         relative = excess / most if most else math.inf if excess else 0.0
-        yield Size(name, "file", "size", excess, relative, Tolerance(0.0, 0.0), over <= 0, None, reason)
+        yield Size(
+            format=name,
+            runtime="file",
+            output="size",
+            max_abs_diff=excess,
+            max_rel_diff=relative,
+            tolerance=Tolerance(0.0, 0.0),
+            passed=over <= 0,
+            worst_input=None,
+            reason=reason,
+        )

@@ -22,7 +22,9 @@ def _batch(step: Step) -> str:
     bias = step.take(channels) if step.get("center", True) else np.zeros(channels, np.float32)
     mean, variance = step.take(channels), step.take(channels)
     epsilon = float(step.get("epsilon", 1e-3))
-    return nn.batch(step.net, step.x, scale, bias, mean, variance, epsilon, channels=axis)
+    return nn.batch(
+        step.net, step.x, scale=scale, bias=bias, mean=mean, variance=variance, epsilon=epsilon, channels=axis
+    )
 
 
 def _layer(step: Step) -> str:

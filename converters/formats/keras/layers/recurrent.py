@@ -49,7 +49,19 @@ def _cell(step: Step, kind: str, width: int) -> _Cell:
         def lstm(x: str, states: Sequence[str]) -> list[str]:
             product = b.add("MatMul", [x, kernels[0]])
             h, c = states
-            return [*nn.lstm(b, product, h, c, kernels[1], bias, "ifgo", activation=activation, gate=gate)]
+            return [
+                *nn.lstm(
+                    b,
+                    product,
+                    h=h,
+                    c=c,
+                    recurrent=kernels[1],
+                    bias=bias,
+                    gates="ifgo",
+                    activation=activation,
+                    gate=gate,
+                )
+            ]
 
         return _Cell(lstm, (units, units))
 

@@ -178,7 +178,15 @@ class Importer(Builder):
             inputs = tuple(self.values.get(n) if n else None for n in names)
             version = self.opsets.get("" if proto.domain in STANDARD else proto.domain, 0)
             name = proto.name or next((o for o in proto.output if o), "?")
-            op = Op(proto.op_type, proto.domain, name, version, inputs, {}, tuple(proto.output))
+            op = Op(
+                kind=proto.op_type,
+                domain=proto.domain,
+                name=name,
+                opset=version,
+                inputs=inputs,
+                attrs={},
+                outputs=tuple(proto.output),
+            )
             try:
                 op = replace(op, attrs={a.name: attribute_of(a, self.detached) for a in proto.attribute})
             except UnsupportedOpError as error:

@@ -22,7 +22,7 @@ def _batch(op: Op, net: Importer) -> list[str | None]:
             "call model.eval() before the export",
         )
     scale, bias, mean, variance = (net.needed_constant(op.need(i), "its statistics") for i in range(1, 5))
-    value = nn.batch(net, op.need(0), scale, bias, mean, variance, _epsilon(op))
+    value = nn.batch(net, op.need(0), scale=scale, bias=bias, mean=mean, variance=variance, epsilon=_epsilon(op))
     return [value, *[None] * (len(op.outputs) - 1)]
 
 

@@ -143,7 +143,7 @@ def _lstm(op: Op, net: Importer) -> list[str | None]:
 
     def turn(product: str, states: Sequence[str | None]) -> Sequence[str]:
         h, c = states
-        return nn.lstm(net, product, h, c, inner, bias, "iofg")
+        return nn.lstm(net, product, h=h, c=c, recurrent=inner, bias=bias, gates="iofg")
 
     return _outputs(net, steps, steps.over(products, turn, [_rows_of(op, net, 5, steps), _rows_of(op, net, 6, steps)]))
 

@@ -100,7 +100,9 @@ def _conv(
     dilation: Any = 1,
     groups: Any = 1,
 ) -> Tensor:
-    return _convolution(m, x, weight, bias, stride, padding, dilation, groups)
+    return _convolution(
+        m, x, weight=weight, bias=bias, stride=stride, padding=padding, dilation=dilation, groups=groups
+    )
 
 
 def _traced_conv(
@@ -118,7 +120,9 @@ def _traced_conv(
 ) -> Tensor:
     if transposed:
         raise UnsupportedOpError("a transposed convolution", why="policies have none")
-    return _convolution(m, x, weight, bias, stride, padding, dilation, groups)
+    return _convolution(
+        m, x, weight=weight, bias=bias, stride=stride, padding=padding, dilation=dilation, groups=groups
+    )
 
 
 def _max_pool(axes: int) -> Callable[..., Tensor]:
@@ -194,7 +198,9 @@ def _batch_norm(
     value = m.b.cast(m.ref(x), FLOAT32)
     m.expect(value, 1, len(centre))
     with np.errstate(all="ignore"):
-        return Tensor(normalisation.batch(m.b, value, scale, shift, centre, spread, float(eps)))
+        return Tensor(
+            normalisation.batch(m.b, value, scale=scale, bias=shift, mean=centre, variance=spread, epsilon=float(eps))
+        )
 
 
 OPS: Mapping[str, Callable[..., Any]] = {

@@ -23,7 +23,15 @@ def _lstm_step(m: Machine, x: str, states: Sequence[str], weights: Sequence[np.n
     m.expect(x, -1, kernel.shape[1])
     product = m.b.add("MatMul", [x, m.b.const(kernel.T, "kernel")])
     bias = biases[0] + biases[1] if biases else None
-    made = nn.lstm(m.b, product, states[0], states[1], m.b.const(inner.T, "recurrent_kernel"), bias, "ifgo")
+    made = nn.lstm(
+        m.b,
+        product,
+        h=states[0],
+        c=states[1],
+        recurrent=m.b.const(inner.T, "recurrent_kernel"),
+        bias=bias,
+        gates="ifgo",
+    )
     return list(made)
 
 
