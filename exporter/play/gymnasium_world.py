@@ -8,6 +8,7 @@ where they usually are: ``info["action_mask"]``, the observation's ``action_mask
 from __future__ import annotations
 
 import importlib
+import math
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -39,7 +40,7 @@ class GymnasiumWorld:
         self._space = getattr(self._environments[0], "action_space", None)
         self._check_actions()
         seen, info = self._reset(self._environments[0], 0)
-        _observations_of(signature, seen, self.name)
+        _observations_of(signature, [seen], self.name)
         if self._masked and self._masks_of(self._environments[0], seen, info) is None:
             raise UsageError(
                 f"--env {name}: the policy takes masks, and the environment gives none",
@@ -53,23 +54,25 @@ class GymnasiumWorld:
         seeds = np.random.SeedSequence(seed).generate_state(episodes) >> np.uint32(1)
         rows = [self._reset(env, int(s)) for env, s in zip(self._environments[:episodes], seeds, strict=True)]
         self._ended = np.zeros(episodes, bool)
-        self._rows = [self._row(env, *row) for env, row in zip(self._environments, rows, strict=False)]
+        self._seen = [seen for seen, _ in rows]
+        self._infos = [info for _, info in rows]
+        self._masks = [self._masks_of(self._environments[r], *rows[r]) for r in range(episodes)] if self._masked else []
         return self._view()
 
     def step(self, continuous: Array | None, discrete: Array | None) -> Outcome:
         """Step every environment whose episode goes on."""
-        count = len(self._rows)
+        count = len(self._seen)
         rewards, ended, success = np.zeros(count), self._ended.copy(), np.zeros(count, bool)
-        for row in np.flatnonzero(~self._ended):
-            env = self._environments[row]
-            action = self._action(
-                None if continuous is None else continuous[row], None if discrete is None else discrete[row]
-            )
-            with _own_code(self.name, "step"):
-                seen, reward, terminated, truncated, info = env.step(action)
+        rows = np.flatnonzero(~self._ended).tolist()
+        actions = self._actions(continuous, discrete)
+        with _own_code(self.name, "step"):
+            for row in rows:
+                seen, reward, terminated, truncated, info = self._environments[row].step(actions[row])
+                self._seen[row], self._infos[row] = seen, info
                 rewards[row], ended[row] = float(reward), bool(terminated or truncated)
-            success[row] = any(bool(info.get(key, False)) for key in _SUCCESS)
-            self._rows[row] = self._row(env, seen, info)
+                success[row] = bool(info) and any(bool(info.get(key, False)) for key in _SUCCESS)
+        for row in rows if self._masked else ():
+            self._masks[row] = self._masks_of(self._environments[row], self._seen[row], self._infos[row])
         self._ended = ended
         return Outcome(self._view(), rewards, ended, success)
 
@@ -82,14 +85,9 @@ class GymnasiumWorld:
             seen, info = env.reset(seed=seed)
         return seen, info
 
-    def _row(self, env: Any, seen: Any, info: Mapping[str, Any]) -> tuple[dict[str, Array], Array | None]:
-        masks = self._masks_of(env, seen, info) if self._masked else None
-        return _observations_of(self._signature, seen, self.name), masks
-
     def _view(self) -> View:
-        names = [s.name for s in self._signature.observations]
-        stacked = {name: np.stack([observations[name] for observations, _ in self._rows]) for name in names}
-        masks = [m for _, m in self._rows if m is not None]
+        masks = [m for m in self._masks if m is not None]
+        stacked = _observations_of(self._signature, self._seen, self.name)
         return View(stacked, np.stack(masks).astype(np.float32) if masks else None)
 
     def _masks_of(self, env: Any, seen: Any, info: Mapping[str, Any]) -> Array | None:
@@ -126,16 +124,17 @@ class GymnasiumWorld:
                 fix="choose an environment that the policy was trained in",
             )
 
-    def _action(self, continuous: Array | None, discrete: Array | None) -> Any:
-        """Return one action as the environment takes it: a number, a list of choices, or a box within its bounds."""
+    def _actions(self, continuous: Array | None, discrete: Array | None) -> list[Any]:
+        """Return actions as the environment takes them: a number, a list of choices, or a box within its bounds."""
+        space: Any = self._space
         if continuous is None:
             assert discrete is not None
-            if not hasattr(self._space, "nvec"):
-                return int(discrete[0]) + int(getattr(self._space, "start", 0))
-            return np.asarray(discrete, np.int64)
-        space: Any = self._space
+            if not hasattr(space, "nvec"):
+                return [int(choice) for choice in discrete[:, 0] + int(getattr(space, "start", 0))]
+            return list(np.asarray(discrete, np.int64))
         low, high = getattr(space, "low", -np.inf), getattr(space, "high", np.inf)
-        return np.clip(continuous.reshape(space.shape), low, high).astype(getattr(space, "dtype", np.float32))
+        boxes = continuous.reshape(len(continuous), *space.shape)
+        return list(np.clip(boxes, low, high).astype(getattr(space, "dtype", np.float32)))
 
 
 def _choices(space: Any) -> tuple[int, ...] | None:
@@ -145,23 +144,27 @@ def _choices(space: Any) -> tuple[int, ...] | None:
     return (int(space.n),) if hasattr(space, "n") else None
 
 
-def _observations_of(signature: PolicySignature, seen: Any, name: str) -> dict[str, Array]:
-    """Return one agent's observations by the policy's names. Raises UsageError where they do not fit."""
-    specs = signature.observations
-    if isinstance(seen, Mapping):
-        given = {key: np.asarray(value) for key, value in seen.items() if key not in _MASKS}
-    else:
-        given = {specs[0].name: np.asarray(seen)} if len(specs) == 1 else {"the observation": np.asarray(seen)}
+def _observations_of(signature: PolicySignature, seen: Sequence[Any], name: str) -> dict[str, Array]:
+    """Return what all agents see by the policy's names. Raises UsageError where it does not fit."""
+    specs, first = signature.observations, seen[0]
+    try:
+        if isinstance(first, Mapping):
+            given = {key: np.asarray([row[key] for row in seen]) for key in first if key not in _MASKS}
+        else:
+            given = {specs[0].name if len(specs) == 1 else "the observation": np.asarray(seen)}
+    except (KeyError, ValueError) as error:
+        raise UsageError(
+            f"--env {name}: episodes differ in what they observe",
+            why=f"{type(error).__name__}: {error}",
+            fix="give the same observations in the same shapes at every step",
+        ) from error
     found = {}
     for spec in specs:
-        key = (
-            spec.name
-            if spec.name in given
-            else next((k for k, v in given.items() if len(given) == len(specs) == 1), "")
-        )
+        only = next(iter(given)) if len(given) == len(specs) == 1 else ""
+        key = spec.name if spec.name in given else only
         array = None if key not in given else _fit_shape(spec, given[key])
         if array is None:
-            shapes = ", ".join(f"{k} {list(v.shape)}" for k, v in given.items())
+            shapes = ", ".join(f"{k} {list(v.shape[1:])}" for k, v in given.items())
             raise UsageError(
                 f"--env {name}: the policy does not fit the environment",
                 why=f"the policy observes {spec.name!r} {spec.shape_text}; the environment gives {shapes}",
@@ -172,14 +175,15 @@ def _observations_of(signature: PolicySignature, seen: Any, name: str) -> dict[s
 
 
 def _fit_shape(spec: TensorSpec, array: Array) -> Array | None:
-    """Return an observation in the policy's shape: as it is, flat, or one number of several as a vector with a 1."""
-    wanted = spec.shape[1:]
-    if len(wanted) == array.ndim and all(n in (None, m) for n, m in zip(wanted, array.shape, strict=True)):
+    """Return observations [agents, ...] in the policy's shape: as they are, flat, or a number as a vector with a 1."""
+    wanted, given = spec.shape[1:], array.shape[1:]
+    if len(wanted) == len(given) and all(n in (None, m) for n, m in zip(wanted, given, strict=True)):
         return array
-    if len(wanted) == 1 and array.size == wanted[0]:
-        return array.reshape(-1)
-    if len(wanted) == 1 and array.ndim == 0 and array.dtype.kind in "iu" and wanted[0] is not None:
-        return np.eye(wanted[0], dtype=np.float32)[int(array)] if 0 <= int(array) < wanted[0] else None
+    if len(wanted) == 1 and math.prod(given) == wanted[0]:
+        return array.reshape(len(array), -1)
+    if len(wanted) == 1 and not given and array.dtype.kind in "iu" and wanted[0] is not None:
+        fits = bool(((array >= 0) & (array < wanted[0])).all())
+        return np.eye(wanted[0], dtype=np.float32)[array] if fits else None
     return None
 
 
@@ -202,7 +206,8 @@ def gymnasium_maker(env: str, known: Sequence[str]) -> MakeWorld:
             why="Gymnasium has none of that name either",
             fix=f"one of {', '.join(known)}, a Gymnasium id such as CartPole-v1, or module:make",
         )
-    return lambda signature: GymnasiumWorld(env, lambda: gymnasium.make(env), signature)
+    # Its checker looks at every step of every episode, which takes a third of the time.
+    return lambda signature: GymnasiumWorld(env, lambda: gymnasium.make(env, disable_env_checker=True), signature)
 
 
 def own_maker(env: str) -> MakeWorld:
