@@ -11,8 +11,6 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-from msgspec import Struct
 from msgspec.structs import replace
 
 from converters.files.fetch import read_bytes
@@ -20,58 +18,38 @@ from converters.formats.bundle import bundle
 from converters.formats.registry import FORMATS
 from converters.interfaces.text import loop_lines, tables
 from exporter.inspect.inspection import port_tables
-from exporter.play.equivalence import CONFIDENCE
-from exporter.play.student import t_quantile
-from exporter.reports.markdown import code, markdown_table, text
+from exporter.reports.markdown import code, markdown_table, play_table, text
 from exporter.snippets.contract import read_bundle
 from exporter.snippets.registry import snippets
 from exporter.tables import size_text
+from exporter.verify.plays import PlayRecord, read_plays
 from signatures.contract import PARITY, POLICY, Contract, json_of
-from signatures.errors import BundleError, UsageError
+from signatures.errors import BundleError
 from signatures.fields import Field, FieldError
 
-CARD, PLAY = "README.md", "play.json"
+CARD = "README.md"
 #: Snippets that a card shows, the first of which a bundle has the files for.
 _LOADED_BY = ("onnxruntime", "load-policy", "saved-model", "inference-engine", "policy-tfjs")
-_MOST_RECORD_BYTES, _MOST_RETURNS = 16 << 20, 1_000_000
+_MOST_RECORD_BYTES = 16 << 20
 
 
-class Returns(Struct, frozen=True):
-    """Mean return of what played, with its interval."""
-
-    who: str
-    mean: float
-    low: float
-    high: float
-    episodes: int
-
-    @property
-    def words(self) -> str:
-        """``9.31 (9.12 to 9.5)``."""
-        return f"{self.mean:.4g} ({self.low:.4g} to {self.high:.4g})"
-
-
-def card_text(folder: Path, play: Path | None = None) -> str:
-    """Return the card of the bundle in ``folder``; ``play`` is what ``play --json`` said (default: its play.json).
-
-    Raises BundleError where the bundle's files are not those that were written, UsageError for another ``play``.
-    """
+def card_text(folder: Path) -> str:
+    """Return the card of the bundle in ``folder``. Raises BundleError where its files are not those that it lists."""
     found = bundle.Bundle.open(folder)
     found.verify_hashes()
-    record = play if play is not None else folder / PLAY
-    environment, returns = _read_returns(record, found.name) if play is not None or record.is_file() else ("", [])
+    played = read_plays(folder)
     sections = [
         _facts(found.contract),
         _section("What it sees and does", _ports(found.contract)),
         _section("Interface", _interface(found.contract)),
-        _section(f"Returns in {text(environment)}" if environment else "", _returns(returns)),
+        *(_section(f"Returns in {text(record.environment)}", _returns(record)) for record in played),
         _section("Agreement of the files", _agreement(folder)),
         _section("How to load it", _loading(folder)),
         _section("Files", _files(found.contract)),
     ]
     body = "\n\n".join(part for part in sections if part)
     formats = [f.key for f in FORMATS if f.main and found.has(f)]
-    metadata = _metadata(found.name, formats, environment, returns)
+    metadata = _metadata(found.name, formats, played)
     return f"---\n{metadata}---\n\n# {text(found.name)}\n\n{body}\n"
 
 
@@ -82,23 +60,22 @@ def _section(title: str, lines: Sequence[str]) -> str:
 # ------------------------------------------------------------------ what a hub reads
 
 
-def _metadata(name: str, formats: Sequence[str], environment: str, returns: Sequence[Returns]) -> str:
+def _metadata(name: str, formats: Sequence[str], played: Sequence[PlayRecord]) -> str:
     """The YAML; texts are in JSON's quotes, which YAML reads alike."""
     lines = ["pipeline_tag: reinforcement-learning", "tags:"]
     lines += [f"- {_json_text(tag)}" for tag in ("reinforcement-learning", "export-model", *formats)]
-    if environment and returns:
-        best = returns[0]
+    if played:
+        lines += ["model-index:", f"- name: {_json_text(name)}", "  results:"]
+    for record in played:
+        best = record.reference.returns
         value = f"{best.mean:.4g} +/- {(best.high - best.low) / 2:.4g}"
         lines += [
-            "model-index:",
-            f"- name: {_json_text(name)}",
-            "  results:",
             "  - task:",
             "      type: reinforcement-learning",
             "      name: reinforcement-learning",
             "    dataset:",
-            f"      name: {_json_text(environment)}",
-            f"      type: {_json_text(environment)}",
+            f"      name: {_json_text(record.environment)}",
+            f"      type: {_json_text(record.environment)}",
             "    metrics:",
             "    - type: mean_reward",
             f"      value: {_json_text(value)}",
@@ -147,10 +124,9 @@ def _interface(contract: Contract) -> list[str]:
     return lines if lines and lines[-1] else lines[:-1]
 
 
-def _returns(returns: Sequence[Returns]) -> list[str]:
-    rows = [[text(r.who), r.words, str(r.episodes)] for r in returns]
-    head = ("played by", f"mean return ({CONFIDENCE:.0%} interval)", "episodes")
-    return markdown_table(head, rows) if rows else []
+def _returns(record: PlayRecord) -> list[str]:
+    margin = f"Margin of the verdict: ± {record.margin:.4g} ({text(record.asked)}); seed {record.seed}."
+    return [*play_table(record), "", margin]
 
 
 def _agreement(folder: Path) -> list[str]:
@@ -189,45 +165,13 @@ def _files(contract: Contract) -> list[str]:
     return [*markdown_table(("file", "size", "sha256"), rows), "", said]
 
 
-# ------------------------------------------------------------------ returns
-
-
-def _read_returns(file: Path, name: str) -> tuple[str, list[Returns]]:
-    """The environment and the mean returns in what ``play --json`` said of the policy ``name``."""
-    try:
-        whole = _record(file)
-        environment, policy = whole["environment"].text(), whole["policy"].text()
-        if policy != name:
-            raise whole["policy"].error(f"is {policy[:60]!r}, and the bundle is of {name!r}")
-        reference = whole["reference"]
-        others = whole["played"].items()
-        named = [f"{entry['format'].text()} in {entry['runtime'].text()}" for entry in others]
-        found = [_mean(reference["name"].text(), reference["returns"])]
-        found += [_mean(who, entry["returns"]) for who, entry in zip(named, others, strict=True)]
-    except FieldError as error:
-        raise UsageError(
-            f"{file.name} must be what 'export-model play BUNDLE --env ENV --json' prints", why=str(error)[:300]
-        ) from error
-    return environment, found
-
-
-def _mean(who: str, returns: Field) -> Returns:
-    values = np.array([r.number() for r in returns.items(_MOST_RETURNS)], np.float64)
-    if not values.size:
-        raise returns.error("is empty")
-    error = float(values.std(ddof=1)) / values.size**0.5 if values.size > 1 else 0.0
-    near = t_quantile((1 - CONFIDENCE) / 2, values.size - 1) * error if values.size > 1 else 0.0
-    mean = float(values.mean())
-    return Returns(who, mean, mean - near, mean + near, int(values.size))
-
-
 def _record(file: Path) -> Field:
     return Field(json_of(read_bytes(file, most=_MOST_RECORD_BYTES)))
 
 
-def write_card(folder: Path, play: Path | None = None) -> Path:
-    """Write README.md into the bundle. Raises BundleError, UsageError."""
-    content = card_text(folder, play)
+def write_card(folder: Path) -> Path:
+    """Write README.md into the bundle. Raises BundleError."""
+    content = card_text(folder)
     file = folder / CARD
     with bundle.writing(file):
         file.write_bytes(content.encode("utf-8"))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from exporter.cli.group import FILE, PATH, command
+from exporter.cli.group import PATH, command
 from exporter.cli.options import one_bundle
 from exporter.cli.terminal import say
 from signatures.errors import UsageError
@@ -16,11 +16,9 @@ from signatures.errors import UsageError
     "card",
     "Write README.md for a model hub.",
     ("export-model card exported/3DBall", "into the bundle"),
-    ("export-model card exported/3DBall --play play.json", "with its returns"),
 )
 @click.argument("bundle", type=PATH, metavar="BUNDLE")
-@click.option("--play", type=FILE, metavar="FILE", help="What 'play --json' printed (default: its play.json).")
-def card_command(bundle: Path, play: Path | None) -> None:
+def card_command(bundle: Path) -> None:
     """Write the card of a bundle: what it sees and does, interface, returns, agreement, files, how to load it.
 
     The licence is left to whoever publishes it.
@@ -35,4 +33,4 @@ def card_command(bundle: Path, play: Path | None) -> None:
             f"{bundle} is not a bundle",
             fix=f"{command_text(bundle, '-o', 'exported')}    (then: export-model card exported)",
         )
-    say(f"wrote {path_text(write_card(place or bundle, play))}")
+    say(f"wrote {path_text(write_card(place or bundle))}")

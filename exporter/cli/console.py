@@ -171,6 +171,8 @@ class Console(Struct, frozen=True):
         for line in failure_lines(report):
             indent = line[: len(line) - len(line.lstrip())]
             say_paragraph(line.lstrip(), indent, f"{indent}    ")
+        for played in report.played:
+            say_paragraph(f"played in {played.environment}: {played.sentence}")
         missing = not_run_line(report)
         if not self.quiet and report.passed is not None and missing is not None:
             say_paragraph(missing)

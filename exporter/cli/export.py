@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from exporter.export.pipeline import ExportResult
     from exporter.play.report import PlayReport
     from exporter.reports.entry import Entry
+    from exporter.reports.markup import Markup
     from exporter.verify.options import VerifyOptions
     from signatures.code import CodeOptions
     from signatures.errors import ExportModelError
@@ -173,10 +174,11 @@ def _export_few(sources: Sequence[Path], job: ExportOptions, env: str | None, co
     """Export sources in this process, and leave with the status of what came of it."""
     results, refused = _export_all(sources, job, console)
     played: list[PlayReport] = [] if env is None else _play(env, sources[0], results, job, console)
+    results = [_with_played(result, played) for result in results]
     told: dict[str, object] = {"refused": [e.to_dict() for e in refused]} if refused else {}
     told |= {"play": [p.to_dict() for p in played]} if played else {}
     console.json({"policies": [r.to_dict() for r in results], **told})
-    console.write_reports(lambda: _entries(results, job.parity.steps))
+    console.write_reports(lambda: _entries(results, job.parity.steps, played))
     console.next_step(results, job.compile.names, job.profile)
     status = 2 if refused else _status(results, played)
     if status:
@@ -240,6 +242,7 @@ def _play(
 ) -> list[PlayReport]:
     """Play with each bundle whose formats agree; the source is the reference of the only one."""
     from exporter.play.play import play_policy
+    from exporter.play.record import keep_record
     from exporter.verify.options import VerifyOptions
 
     judging = VerifyOptions(runtimes=job.verify, rules=job.parity.rules)
@@ -258,13 +261,40 @@ def _play(
                 judging=judging,
                 progress=progress,
             )
+        report = keep_record(result.folder, report)
         console.report_play(report)
         played.append(report)
     return played
 
 
-def _entries(results: Sequence[ExportResult], steps: int) -> list[Entry]:
+def _with_played(result: ExportResult, played: Sequence[PlayReport]) -> ExportResult:
+    """Return a result whose report has what was played with it."""
+    from msgspec.structs import replace
+
+    own = tuple(p.record for p in played if p.policy == result.policy.name)
+    if result.report is None or not own:
+        return result
+    return replace(result, report=replace(result.report, played=own))
+
+
+def _entries(results: Sequence[ExportResult], steps: int, played: Sequence[PlayReport]) -> list[Entry]:
+    from msgspec.structs import replace
+
     from exporter.reports.entry import of_result
 
-    words = as_given(RULES)
-    return [entry for entry in (of_result(result, steps, words) for result in results) if entry is not None]
+    words, found = as_given(RULES), []
+    for result in results:
+        entry = of_result(result, steps, words)
+        if entry is not None:
+            found.append(replace(entry, more=_pictures(p for p in played if p.policy == entry.name)))
+    return found
+
+
+def _pictures(played: Iterable[PlayReport]) -> tuple[Markup, ...]:
+    """Return the sections of a page on what was played; nothing is imported where nothing was."""
+    found = list(played)
+    if not found:
+        return ()
+    from exporter.play.documents import returns_section
+
+    return tuple(returns_section(report) for report in found)

@@ -29,6 +29,7 @@ from exporter.export.sources import Source, read_source
 from exporter.verify.checks.decisions import decisions
 from exporter.verify.options import VerifyOptions
 from exporter.verify.participants import policy_under_test, write_reference
+from exporter.verify.plays import read_plays
 from exporter.verify.report import ParityReport
 from exporter.verify.session import Session
 from exporter.verify.verification import verify
@@ -128,6 +129,7 @@ def verify_folder(
         own = (case.judge or FROZEN_GRAPH).key
         report = replace(report, reference=f"{own}/{KERNELS}", self_consistent=False)
         report = _with_note(report, f"the source was not given: the reference is the bundle's own .{own}")
+    report = replace(report, played=read_plays(folder))
     return _unless_unverified(report, case, required=not (allow_unverified or runtimes == "none"))
 
 

@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 
 from exporter import __version__
 from exporter.play import pictures
-from exporter.play.equivalence import CONFIDENCE, DIFFERENT, EQUIVALENT, NOT_DECIDED
 from exporter.play.report import PlayReport, figure, signed_text
 from exporter.reports import sections
 from exporter.reports.entry import Entry
-from exporter.reports.junit import count_cases, junit_file, suites_of
-from exporter.reports.markdown import code, text
+from exporter.reports.junit import junit_file, play_suite, suites_of
+from exporter.reports.markdown import PLAY_MARKS, code, text
 from exporter.reports.markup import Markup, el
 from exporter.reports.page import document
 from exporter.reports.write import Documents
-from signatures.fields import printable
+from exporter.verify.plays import CONFIDENCE, DIFFERENT, EQUIVALENT, NOT_DECIDED
 
 _CHIPS = {
     EQUIVALENT: ("passed", "Equivalent"),
     DIFFERENT: ("failed", "Different"),
     NOT_DECIDED: ("unverified", "Not decided"),
 }
-_MARKS = {EQUIVALENT: "✅", DIFFERENT: "❌", NOT_DECIDED: "⚠️"}
 _HEAD = (
     "format",
     "runtime",
@@ -43,33 +40,13 @@ def play_documents(report: PlayReport) -> Documents:
 
 def junit(report: PlayReport) -> bytes:
     """A suite of returns, a case for everything that played; then the suites of the replay."""
-    suite = ET.Element("testsuite", name=printable(f"{report.policy}.play.{report.environment}"))
-    properties = ET.SubElement(suite, "properties")
-    facts = {
-        "verdict": report.sentence,
-        "episodes": report.options.episodes,
-        "seed": report.options.seed,
-        "margin": report.margin,
-    }
-    for name, value in facts.items():
-        ET.SubElement(properties, "property", name=name, value=printable(str(value)))
-    for played in report.played:
-        place = f"{report.policy}.{played.format}.{played.runtime}"
-        case = ET.SubElement(suite, "testcase", classname=printable(place), name="returns")
-        if played.compared.verdict == DIFFERENT:
-            message = printable(f"{played.where}: {played.sentence}")
-            ET.SubElement(case, "failure", type="export-model.returns", message=message).text = message
-        elif played.compared.verdict == NOT_DECIDED:
-            message = printable(f"{played.where}: {played.sentence}")
-            ET.SubElement(case, "skipped", type="export-model.not-decided", message=message)
-    count_cases(suite)
-    return junit_file([suite, *suites_of(Entry(report.replay))])
+    return junit_file([play_suite(report.policy, report.record), *suites_of(Entry(report.replay))])
 
 
 def markdown(report: PlayReport) -> str:
     """A summary for a CI job's page."""
     lines = [
-        f"### {_MARKS[report.verdict]} {code(report.policy)} in {code(report.environment)}",
+        f"### {PLAY_MARKS[report.verdict]} {code(report.policy)} in {code(report.environment)}",
         "",
         text(report.sentence),
         "",
@@ -77,7 +54,9 @@ def markdown(report: PlayReport) -> str:
     for finding in report.replay.failures:
         first, *rest = finding.explanation()
         lines += [f"- ❌ {text(first)}", *(f"  - {text(line)}" for line in rest)]
-    lines += [f"- {_MARKS[p.compared.verdict]} {text(f'{p.where}: {p.sentence}')}" for p in report.played if p.sentence]
+    lines += [
+        f"- {PLAY_MARKS[p.compared.verdict]} {text(f'{p.where}: {p.sentence}')}" for p in report.played if p.sentence
+    ]
     rows = [[code(cells[0]), code(cells[1]), *cells[2:]] for cells in _rows(report)]
     own = report.episodes
     mean = [code(report.reference), "", figure(own.returns.mean()), "", "", "", f"{own.rate:,.0f}", "reference"]
@@ -101,7 +80,7 @@ def html(report: PlayReport) -> str:
         ),
         el("p", f"{says[:1].upper()}{says[1:]}.", class_="lead"),
         _facts(report),
-        _returns(report),
+        returns_section(report),
         sections.failures(replay),
         sections.agreement(replay),
         sections.memory(replay),
@@ -133,7 +112,7 @@ def _facts(report: PlayReport) -> Markup:
     return el("dl", [el("div", el("dt", k), el("dd", v)) for k, v in found], class_="facts")
 
 
-def _returns(report: PlayReport) -> Markup:
+def returns_section(report: PlayReport) -> Markup:
     """What everything earned: a table, the intervals beside the margin, returns beside each other, survival."""
     rows = []
     for cells, played in zip(_rows(report), report.played, strict=True):

@@ -27,12 +27,10 @@ import numpy as np
 from msgspec import Struct
 
 from exporter.play.student import t_quantile
+from exporter.verify.plays import CONFIDENCE, DIFFERENT, EQUIVALENT, NOT_DECIDED, Interval
 from exporter.verify.statistics import FALSE_ALARM
 from signatures.errors import UsageError
 
-EQUIVALENT, DIFFERENT, NOT_DECIDED = "EQUIVALENT", "DIFFERENT", "NOT DECIDED"
-#: Of the interval that has to lie within the margin.
-CONFIDENCE = 0.95
 #: Of returns, those that tell how far they usually lie apart.
 PERCENTILES = (5, 95)
 #: Fewer say nothing: twenty equal differences are as rare as FALSE_ALARM where either sign is as likely.
@@ -117,6 +115,14 @@ def equivalence(reference: np.ndarray, candidate: np.ndarray, margin: float) -> 
         equal=equal,
         needed=needed,
     )
+
+
+def mean_interval(values: np.ndarray) -> Interval:
+    """Return the mean of ``values``, float64 [episodes], with Student's interval."""
+    mean, count = float(values.mean()), len(values)
+    error = float(values.std(ddof=1)) / math.sqrt(count)
+    near = t_quantile((1 - CONFIDENCE) / 2, count - 1) * error
+    return Interval(mean, mean - near, mean + near)
 
 
 def _episodes_needed(mean: float, deviation: float, margin: float, near: float) -> int | None:

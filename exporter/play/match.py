@@ -15,7 +15,7 @@ from converters.graph.run import run_graph
 from converters.policy.policy import Policy
 from exporter.acting.policy import LoadedPolicy
 from exporter.play.episodes import Episodes, Watch, play_episodes, turn_seed
-from exporter.play.equivalence import CONFIDENCE, DIFFERENT, EQUIVALENT, Equivalence, equivalence
+from exporter.play.equivalence import Equivalence, equivalence
 from exporter.play.options import PlayOptions
 from exporter.play.recording import Recorder
 from exporter.play.replay import replay
@@ -23,6 +23,7 @@ from exporter.play.worlds import MakeWorld
 from exporter.verify.checks.rollout import rollout
 from exporter.verify.findings import Finding
 from exporter.verify.participants import Participant, PolicyUnderTest
+from exporter.verify.plays import CONFIDENCE, DIFFERENT, EQUIVALENT
 from exporter.verify.reference import Reference
 from exporter.verify.report import ParityReport
 from exporter.verify.session import Session

@@ -7,10 +7,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from exporter.play.equivalence import DIFFERENT, PERCENTILES
+from exporter.play.equivalence import PERCENTILES
 from exporter.play.report import PlayReport, figure, signed_text
 from exporter.reports.charts import colour_of
 from exporter.reports.markup import Markup, el, svg
+from exporter.verify.plays import DIFFERENT
 
 _LEFT, _RIGHT, _ROW = 8.0, 314.0, 34.0
 #: Points of a survival curve.

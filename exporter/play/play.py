@@ -21,6 +21,7 @@ from exporter.export.pipeline import export
 from exporter.play.match import Match
 from exporter.play.named import world_maker
 from exporter.play.options import PlayOptions
+from exporter.play.record import keep_record
 from exporter.play.report import PlayReport
 from exporter.play.worlds import MakeWorld
 from exporter.remote.fetching import nearby
@@ -53,6 +54,7 @@ def play_policy(
     - ``options``: episodes, seed, margin; ``partner``: the bundle that plays the other side, where there is one.
     - ``understanding``, ``read``: how to read the reference; ``judging``: the runtimes, the tolerances of the replay.
 
+    What the formats of a bundle earned beside their own reference is kept in its parity.json.
     Raises ExportModelError. A disagreement is not raised: ``passed`` is False.
     """
     options = options or PlayOptions()
@@ -87,7 +89,7 @@ def play_policy(
     assert match.policy is not None
     if match.reference is None:
         raise RunFailedError("the reference cannot play", why="\n".join(c.sentence() for c in report.failures) or None)
-    return PlayReport(
+    played = PlayReport(
         policy=match.policy.name,
         environment=match.world_name,
         options=options,
@@ -99,6 +101,8 @@ def play_policy(
         recorded=match.recorded,
         notes=match.notes,
     )
+    own = not given and (first / POLICY).is_file() and first == Path(reference)
+    return keep_record(first, played) if own else played
 
 
 def _export_bundle(

@@ -9,10 +9,11 @@ import numpy as np
 from msgspec import Struct
 
 from exporter.play.episodes import Episodes
-from exporter.play.equivalence import CONFIDENCE, DIFFERENT, EQUIVALENT, NOT_DECIDED, scale_of
+from exporter.play.equivalence import mean_interval, scale_of
 from exporter.play.match import Played
 from exporter.play.options import PlayOptions
 from exporter.tables import table
+from exporter.verify.plays import CONFIDENCE, DIFFERENT, EQUIVALENT, NOT_DECIDED, Interval, Player, PlayRecord
 from exporter.verify.report import ParityReport
 
 
@@ -76,6 +77,22 @@ class PlayReport(Struct, frozen=True):
             )
         return f"{where}: {self.verdict}, {'; '.join(parts)}"
 
+    @property
+    def record(self) -> PlayRecord:
+        """What parity.json keeps of it."""
+        options, own = self.options, self.episodes
+        return PlayRecord(
+            environment=self.environment,
+            verdict=self.verdict,
+            sentence=self.sentence,
+            seed=options.seed,
+            deterministic=options.deterministic,
+            asked=options.margin,
+            margin=self.margin,
+            reference=Player(self.reference, mean_interval(own.returns), len(own.returns)),
+            players=tuple(_player(p) for p in self.played),
+        )
+
     def lines(self) -> Iterator[str]:
         """A table of everything that played, then what is wrong or open."""
         replayed = {(p.format, p.runtime): p.word for p in self.replay.pairs}
@@ -133,6 +150,13 @@ class PlayReport(Struct, frozen=True):
             "replay": self.replay.to_dict(),
             "notes": list(self.notes),
         }
+
+
+def _player(played: Played) -> Player:
+    compared, returns = played.compared, played.episodes.returns
+    difference = Interval(compared.difference, compared.low, compared.high)
+    mean = mean_interval(returns)
+    return Player(played.where, mean, len(returns), compared.verdict, difference, played.sentence)
 
 
 def _entry(played: Played) -> dict[str, Any]:

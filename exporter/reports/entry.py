@@ -12,6 +12,7 @@ from converters.files.fetch import path_text
 from converters.formats.bundle.bundle import Bundle
 from converters.graph.nodes import Graph
 from exporter.export.pipeline import ExportResult
+from exporter.reports.markup import Markup
 from exporter.verify.report import ParityReport
 from signatures.contract import Contract
 from signatures.errors import ExportModelError
@@ -30,6 +31,8 @@ class Entry(Struct, frozen=True):
     steps: int = 4
     #: The words of the command that makes the same comparison, where the first was run; empty: nobody can.
     command: tuple[str, ...] = ()
+    #: Further sections of the page.
+    more: tuple[Markup, ...] = ()
 
     @property
     def name(self) -> str:

@@ -12,6 +12,7 @@ from collections.abc import Iterable, Sequence
 from converters.formats.registry import FORMATS
 from exporter.reports.entry import Entry
 from exporter.verify.findings import Failure, Finding
+from exporter.verify.plays import DIFFERENT, NOT_DECIDED, PlayRecord
 from signatures.fields import printable
 
 
@@ -56,6 +57,30 @@ def suites_of(entry: Entry) -> Iterable[ET.Element]:
             ET.SubElement(case, "skipped", type="export-model.not-run", message=_text(reason))
         count_cases(suite_element)
         yield suite_element
+    yield from (play_suite(report.policy, record) for record in report.played)
+
+
+def play_suite(policy: str, record: PlayRecord) -> ET.Element:
+    """Return a suite of returns, a case for everything that played."""
+    suite = ET.Element("testsuite", name=_text(f"{policy}.play.{record.environment}"))
+    properties = ET.SubElement(suite, "properties")
+    facts = {
+        "verdict": record.sentence,
+        "episodes": record.reference.episodes,
+        "seed": record.seed,
+        "margin": record.margin,
+    }
+    for name, value in facts.items():
+        ET.SubElement(properties, "property", name=name, value=_text(str(value)))
+    for player in record.players:
+        case = ET.SubElement(suite, "testcase", classname=_text(f"{policy}.{player.place}"), name="returns")
+        message = _text(f"{player.name}: {player.sentence}")
+        if player.verdict == DIFFERENT:
+            ET.SubElement(case, "failure", type="export-model.returns", message=message).text = message
+        elif player.verdict == NOT_DECIDED:
+            ET.SubElement(case, "skipped", type="export-model.not-decided", message=message)
+    count_cases(suite)
+    return suite
 
 
 def count_cases(suite: ET.Element) -> None:

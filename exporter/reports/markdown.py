@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 
 from exporter.reports.entry import Entry
 from exporter.tables import size_with_original
+from exporter.verify.plays import CONFIDENCE, DIFFERENT, EQUIVALENT, NOT_DECIDED, PlayRecord
 from exporter.verify.report import ParityReport
 from signatures.fields import printable
 
@@ -15,6 +16,7 @@ _CELLS = "Numbers are the largest difference as a share of what is allowed."
 #: Behind an @, so that no user is called by it.
 UNSEEN = "\u200b"
 _MARKS = {True: "✅", False: "❌", None: "⚠️"}
+PLAY_MARKS = {EQUIVALENT: _MARKS[True], DIFFERENT: _MARKS[False], NOT_DECIDED: _MARKS[None]}
 
 
 def markdown_text(entries: Sequence[Entry]) -> str:
@@ -52,6 +54,8 @@ def _policy(entry: Entry) -> list[str]:
             [code(pair.format), code(pair.runtime), size, *shown, pair.word if pair.passed else f"**{pair.word}**"]
         )
     lines += [*markdown_table(head, rows), "", _CELLS, ""]
+    for record in report.played:
+        lines += [f"{PLAY_MARKS[record.verdict]} {text(record.sentence)}", "", *play_table(record), ""]
     tolerances = [
         f"- {code(c.output)} in {code(f'{c.format}/{c.runtime}')}: atol {c.tolerance.atol:g}, "
         f"rtol {c.tolerance.rtol:g}: {text(c.tolerance.reason)}"
@@ -66,6 +70,13 @@ def _policy(entry: Entry) -> list[str]:
     ]
     lines += _collapsible_section("Runtimes that did not run", missing)
     return lines + _collapsible_section("Notes", [f"- {text(note)}" for note in report.notes])
+
+
+def play_table(record: PlayRecord) -> list[str]:
+    """What each earned in an environment."""
+    head = ("played by", f"mean return ({CONFIDENCE:.0%} interval)", "difference", "episodes", "verdict")
+    rows = [[text(p.name), p.returns.words, p.difference_words, str(p.episodes), p.verdict] for p in record.rows]
+    return markdown_table(head, rows)
 
 
 def _collapsible_section(title: str, lines: Sequence[str]) -> list[str]:

@@ -29,6 +29,7 @@ _HEAT = {
 #: In the order of the page; each gives nothing where it has nothing to say.
 _SECTIONS: tuple[Callable[[Entry], Markup | None], ...] = (
     sections.failures,
+    sections.returns,
     sections.agreement,
     sections.spread,
     sections.memory,
@@ -123,6 +124,7 @@ def _policy(entry: Entry, number: int, *, alone: bool) -> Markup:
         sections.facts(entry),
         sections.again(entry),
         [section(entry) for section in _SECTIONS],
+        list(entry.more),
     )
     if alone:
         return el("section", title, content, class_="policy only", aria_labelledby=f"title-{number}")

@@ -14,6 +14,7 @@ from exporter.reports.layers import blocks_of
 from exporter.reports.markup import Child, Markup, el
 from exporter.tables import command_text, count_text, size_with_original
 from exporter.verify.findings import Failure, Finding, Rollout
+from exporter.verify.plays import CONFIDENCE
 from signatures.spec import TensorSpec
 
 _SHOWN_VALUES = 12
@@ -316,6 +317,28 @@ def files(entry: Entry) -> Markup | None:
         (kind, size_with_original(kind, entry.report.sizes, entry.report.whole_sizes)) for kind in entry.report.sizes
     ]
     return section("Sizes", table("Bytes of each format", ("format", "size"), rows, [1]))
+
+
+def returns(entry: Entry) -> Markup | None:
+    """What the files earned in environments, where no further section shows it with pictures."""
+    if entry.more:
+        return None
+    shown: list[Child] = []
+    head = ("played by", "mean return", f"{CONFIDENCE:.0%} interval", "difference", "episodes", "verdict")
+    for record in entry.report.played:
+        rows = [
+            (
+                p.name,
+                f"{p.returns.mean:.4g}",
+                f"{p.returns.low:.4g} to {p.returns.high:.4g}",
+                p.difference_words,
+                str(p.episodes),
+                p.verdict or "reference",
+            )
+            for p in record.rows
+        ]
+        shown += [el("p", f"{record.sentence}."), table(f"Returns in {record.environment}", head, rows, range(1, 5))]
+    return section("Returns", shown) if shown else None
 
 
 def notes(entry: Entry) -> Markup | None:

@@ -10,6 +10,7 @@ from msgspec.structs import replace
 
 from exporter.tables import count_text
 from exporter.verify.findings import Accepted, Failure, Finding, Played, Shape, Undecided
+from exporter.verify.plays import PlayRecord
 from exporter.verify.verdict import unchecked_formats, verdict
 
 
@@ -84,6 +85,8 @@ class ParityReport(Struct, frozen=True):
     self_consistent: bool = False
     #: The runtime that the original ran in; None where it did not run.
     original: str | None = None
+    #: what the bundle's files earned when they played
+    played: tuple[PlayRecord, ...] = ()
 
     def __repr__(self) -> str:
         compared = count_text(len(self.comparisons), "comparison")
@@ -182,4 +185,5 @@ class ParityReport(Struct, frozen=True):
             "sizes": dict(self.sizes),
             **({"whole_sizes": dict(self.whole_sizes)} if self.whole_sizes else {}),
             "notes": list(self.notes),
+            **({"played": [record.to_dict() for record in self.played]} if self.played else {}),
         }

@@ -5,15 +5,12 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from signatures.contract import POLICY
+from signatures.contract import PARITY, POLICY
 from tests.commands import export_model
 from tests.interfaces.made import run_with
-
-RETURNS = [1.0, 2.0, 3.0, 4.0]
 
 
 @pytest.fixture
@@ -24,15 +21,24 @@ def bundle(tmp_path: Path) -> Path:
     return tmp_path / "out" / "policy"
 
 
-def played(name: str = "policy", environment: str = "Walker-v1") -> dict[str, Any]:
-    """As ``play --json`` prints it, as far as a card reads it."""
-    summary = {"returns": RETURNS}
-    return {
-        "policy": name,
+def keep_played(bundle: Path, environment: str = "Walker-v1") -> None:
+    """As ``play`` keeps it in parity.json."""
+    earned = {"episodes": 4, "mean_return": 2.5, "return_interval": [0.4457, 4.554]}
+    other = {**earned, "name": "onnx in onnxruntime", "verdict": "EQUIVALENT", "difference": 0.0}
+    record = {
         "environment": environment,
-        "reference": {"name": "the original", **summary},
-        "played": [{"format": "onnx", "runtime": "onnxruntime", **summary}],
+        "verdict": "EQUIVALENT",
+        "sentence": "policy: EQUIVALENT",
+        "seed": 0,
+        "deterministic": False,
+        "confidence": 0.95,
+        "margin": {"asked": "1%", "value": 0.025},
+        "reference": {**earned, "name": "the original"},
+        "players": [{**other, "interval": [0.0, 0.0], "sentence": ""}],
     }
+    file = bundle / PARITY
+    content = json.loads(file.read_text())
+    file.write_text(json.dumps({**content, "played": [record]}))
 
 
 def card(folder: Path, *options: object) -> str:
@@ -60,10 +66,10 @@ def test_it_says_what_the_contract_says(bundle: Path) -> None:
     assert "license:" not in text.split("---")[1]  # the user's to say
 
 
-def test_huggingface_hub_reads_it(bundle: Path, tmp_path: Path) -> None:
+def test_huggingface_hub_reads_it(bundle: Path) -> None:
     hub = pytest.importorskip("huggingface_hub", reason="pip install huggingface-hub: it is of the dev extra")
-    (tmp_path / "play.json").write_text(json.dumps(played()))
-    text = card(bundle, "--play", tmp_path / "play.json")
+    keep_played(bundle)
+    text = card(bundle)
     found = hub.ModelCard(text)
     assert isinstance(found.data, hub.ModelCardData)
     assert found.data.pipeline_tag == "reinforcement-learning"
@@ -78,19 +84,16 @@ def test_huggingface_hub_reads_it(bundle: Path, tmp_path: Path) -> None:
     assert again.data.to_dict() == found.data.to_dict()
 
 
-def test_the_interval_of_four_returns(bundle: Path) -> None:
-    """By hand: the mean of 1 to 4 is 2.5, its error 0.6455, Student's quantile for 3 degrees of freedom 3.1824."""
-    (bundle / "play.json").write_text(json.dumps(played()))
-    assert "2.5 (0.4457 to 4.554)" in card(bundle)
+def test_returns_are_those_that_parity_json_keeps(bundle: Path) -> None:
+    keep_played(bundle)
+    text = card(bundle)
+    assert text.count("2.5 (0.4457 to 4.554)") == 2 and "| onnx in onnxruntime |" in text
 
 
-@pytest.mark.parametrize(
-    "record", [{}, [], {"policy": "other"}, {**played(), "reference": {"name": "x", "returns": ["a"]}}, played("other")]
-)
-def test_another_record_is_refused(bundle: Path, tmp_path: Path, record: object) -> None:
-    (tmp_path / "play.json").write_text(json.dumps(record))
-    ran = export_model("card", bundle, "--play", tmp_path / "play.json")
-    assert ran.status == 2 and "must be what 'export-model play" in ran.err
+def test_another_record_is_refused(bundle: Path) -> None:
+    (bundle / PARITY).write_text(json.dumps({"played": [{"environment": 1}]}))
+    ran = export_model("card", bundle)
+    assert ran.status == 2 and "cannot be read: played[0].environment" in ran.err
 
 
 def test_a_bundle_that_was_changed_or_is_none_is_refused(bundle: Path, tmp_path: Path) -> None:
@@ -107,10 +110,10 @@ def test_names_of_strangers_stay_text(tmp_path: Path) -> None:
     labels = {"interface": {"actions": [{"name": name, "size": 2, "scale": [2]}]}, "actions": [name[:100], "b"]}
     (tmp_path / "labels.json").write_text(json.dumps(labels))
     path = run_with(tmp_path)
-    asked = ("--labels", tmp_path / "labels.json", "--to", "onnx", "--verify", "none")
+    asked = ("--labels", tmp_path / "labels.json", "--to", "onnx", "--verify", "onnxruntime")
     assert export_model(path, "-o", tmp_path / "out", *asked).status == 0
     folder = tmp_path / "out" / "policy"
-    (folder / "play.json").write_text(json.dumps(played(environment="a: \"b' #c")))
+    keep_played(folder, "a: \"b' #c")
     text = card(folder)
     found = hub.ModelCard(text)
     assert found.data.license is None

@@ -18,11 +18,11 @@ from msgspec import Struct
 
 from converters.runtimes.pool import RuntimePool
 from exporter import export_model
-from exporter.play.equivalence import DIFFERENT, NOT_DECIDED
 from exporter.play.options import PlayOptions
 from exporter.play.play import play_policy
 from exporter.play.report import PlayReport
 from exporter.verify.options import VerifyOptions
+from exporter.verify.plays import DIFFERENT, NOT_DECIDED
 from fixtures import gym, trained
 
 OURS = ("3DBall", "GridWorld", "Hallway", "Tennis-LeftBrain", "Tennis-RightBrain", "Crawler2D")

@@ -11,10 +11,10 @@ import pytest
 from msgspec.structs import replace
 
 from exporter.play.documents import html, junit, markdown
-from exporter.play.equivalence import DIFFERENT, EQUIVALENT, NOT_DECIDED
 from exporter.play.options import PlayOptions
 from exporter.play.report import PlayReport
 from exporter.verify.options import VerifyOptions
+from exporter.verify.plays import DIFFERENT, EQUIVALENT, NOT_DECIDED
 from tests.commands import export_model, is_refused
 from tests.play.conftest import FEW, Play
 from tests.play.faults import order, through

@@ -8,15 +8,14 @@ import numpy as np
 import pytest
 
 from exporter.play.equivalence import (
-    DIFFERENT,
-    EQUIVALENT,
-    NOT_DECIDED,
     Margin,
     equivalence,
+    mean_interval,
     parse_margin,
     scale_of,
 )
 from exporter.play.student import t_quantile, upper_tail
+from exporter.verify.plays import DIFFERENT, EQUIVALENT, NOT_DECIDED
 from signatures.errors import UsageError
 
 EPISODES = 200
@@ -204,3 +203,8 @@ def test_no_number_of_episodes_decides_where_there_is_no_margin() -> None:
     candidate[0] = 1.0
     found = equivalence(reference, candidate, Margin(0.01).of(reference))
     assert (found.verdict, found.margin, found.needed) == (NOT_DECIDED, 0, None)
+
+
+def test_the_interval_of_a_mean() -> None:
+    """By hand: the mean of 1 to 4 is 2.5, its error 0.6455, Student's quantile for 3 degrees of freedom 3.1824."""
+    assert mean_interval(np.array([1.0, 2.0, 3.0, 4.0])).words == "2.5 (0.4457 to 4.554)"

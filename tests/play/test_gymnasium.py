@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from exporter.play.equivalence import EQUIVALENT
 from exporter.play.gymnasium_world import GymnasiumWorld
 from exporter.play.options import PlayOptions
 from exporter.verify.options import VerifyOptions
+from exporter.verify.plays import EQUIVALENT
 from fixtures import gym
 from fixtures import path as fixture
 from signatures.errors import UsageError

@@ -13,11 +13,11 @@ import pytest
 import export_model as public
 from exporter.play.environments import ENVIRONMENTS
 from exporter.play.episodes import SIDE_BY_SIDE, play_episodes
-from exporter.play.equivalence import DIFFERENT, EQUIVALENT, NOT_DECIDED
 from exporter.play.named import world_maker
 from exporter.play.options import PlayOptions
 from exporter.play.worlds import Outcome, View
 from exporter.verify.options import VerifyOptions
+from exporter.verify.plays import DIFFERENT, EQUIVALENT, NOT_DECIDED
 from fixtures import path as fixture
 from fixtures import trained
 from signatures.errors import UsageError
