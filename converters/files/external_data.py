@@ -18,7 +18,7 @@ from typing import TypeAlias
 import numpy as np
 
 from converters.files.chunks import Pieces
-from converters.files.wire_format import read_varint, varint
+from converters.files.wire_format import BYTES, GROUP, GROUP_END, WireError, message_fields, varint
 
 #: Field number → the fields of the message that it holds, or None where it is what is detached.
 Fields: TypeAlias = Mapping[int, "Fields | None"]
@@ -33,7 +33,6 @@ MAX_FIELDS = 1 << 18
 _SECRET = os.urandom(16)
 _MARK = re.compile(re.escape(_SECRET) + b".{8}", re.DOTALL)
 _MARK_BYTES = len(_SECRET) + 8
-_VARINT, _LONG, _BYTES, _SHORT = 0, 1, 2, 5
 
 
 class Detached:
@@ -78,7 +77,7 @@ class Detached:
         parts: list[bytes | memoryview] = []
         kept = 0
         try:
-            for number, tag_end, start, end in _large(view):
+            for number, tag_end, start, end in _large_fields(view, LARGE, MAX_FIELDS):
                 if number not in fields:
                     continue
                 inner = fields[number]
@@ -91,7 +90,7 @@ class Detached:
                     continue
                 parts += [view[kept:tag_end], varint(sum(map(len, content))), *content]
                 kept = end
-        except _NoMessageError:
+        except WireError:
             return None
         return [*parts, view[kept:]]
 
@@ -108,7 +107,7 @@ class Detached:
             return [array]
         parts: list[bytes | np.ndarray] = []
         kept = next_place = 0
-        for _, tag_end, start, end in _byte_fields(view, _MARK_BYTES):
+        for _, tag_end, start, end in _large_fields(view, _MARK_BYTES):
             first = next_place
             while next_place < len(places) and places[next_place] < offset + end:
                 next_place += 1
@@ -126,49 +125,15 @@ def is_readable(message: Pieces) -> bool:
     return message.size <= MAX_MESSAGE
 
 
-# ------------------------------------------------------------------ protobuf's wire format
-
-
-class _NoMessageError(Exception):
-    pass
-
-
-def _large(view: memoryview) -> Iterator[tuple[int, int, int, int]]:
-    """The large fields. A message of more fields than any model's is left to protobuf, which is quicker with them."""
-    return _byte_fields(view, LARGE, MAX_FIELDS)
-
-
-def _byte_fields(view: memoryview, least: int, most: int | None = None) -> Iterator[tuple[int, int, int, int]]:
+def _large_fields(view: memoryview, least: int, most: int | None = None) -> Iterator[tuple[int, int, int, int]]:
     """(number, end of the tag, start, end) of each field of bytes that has at least so many.
 
-    Raises _NoMessageError for what is no message, or has more fields than ``most``.
+    Raises WireError for what is no message, or has more fields than ``most``: those are left to protobuf, which is
+    quicker with them.
     """
-    at, size, count = 0, len(view), 0
-    while at < size:
-        count += 1
-        if most is not None and count > most:
-            raise _NoMessageError
-        tag, tag_end = _read_varint(view, at)
-        wire = tag & 7
-        if wire == _BYTES:
-            length, start = _read_varint(view, tag_end)
-            at = start + length
-            if at > size:
-                raise _NoMessageError
-            if length >= least:
-                yield tag >> 3, tag_end, start, at
-        elif wire == _VARINT:
-            _, at = _read_varint(view, tag_end)
-        elif wire in (_LONG, _SHORT):
-            at = tag_end + (8 if wire == _LONG else 4)
-        else:
-            raise _NoMessageError
-    if at != size:
-        raise _NoMessageError
-
-
-def _read_varint(view: memoryview, at: int) -> tuple[int, int]:
-    value, end = read_varint(view, at, len(view))
-    if value < 0:
-        raise _NoMessageError
-    return value, end
+    for count, (tag, tag_end, start, end) in enumerate(message_fields(view, 0, len(view)), 1):
+        kind = tag & 7
+        if end > len(view) or kind in (GROUP, GROUP_END) or (most is not None and count > most):
+            raise WireError
+        if kind == BYTES and end - start >= least:
+            yield tag >> 3, tag_end, start, end

@@ -9,9 +9,10 @@ import re
 import struct
 import zipfile
 from functools import cached_property
+from itertools import islice
 from typing import Any
 
-from converters.files.wire_format import read_varint
+from converters.files.wire_format import GROUP, GROUP_END, CutOffError, WireError, message_fields
 from signatures.bounded import loads
 
 _HEAD = 4096
@@ -103,21 +104,15 @@ def _is_op_name(data: bytes) -> bool:
 
 
 def _fields(data: memoryview, limit: int = 64) -> list[tuple[int, int, memoryview]]:
+    """(number, type, content) of a message's first fields, the last of which may be cut off; none of no message."""
     found: list[tuple[int, int, memoryview]] = []
-    at = 0
-    while at < len(data) and len(found) < limit:
-        tag, at = read_varint(data, at, len(data))
-        number, wire = tag >> 3, tag & 7
-        if tag < 0 or number == 0 or wire not in (0, 1, 2, 5):
-            return found if at >= len(data) else []
-        if wire == 0:
-            start = at
-            _, at = read_varint(data, at, len(data))
-            found.append((number, wire, data[start:at]))
-        else:
-            length, at = read_varint(data, at, len(data)) if wire == 2 else ({1: 8, 5: 4}[wire], at)
-            if length < 0:
+    try:
+        for tag, _, start, end in islice(message_fields(data, 0, len(data)), limit):
+            if tag & 7 in (GROUP, GROUP_END):
                 return []
-            found.append((number, wire, data[at : at + length]))
-            at += length
+            found.append((tag >> 3, tag & 7, data[start:end]))
+    except CutOffError:
+        pass
+    except WireError:
+        return []
     return found

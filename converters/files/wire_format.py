@@ -1,8 +1,67 @@
-"""Whole numbers as protobuf and TensorFlow's tables write them: seven bits a byte, the lowest first."""
+"""Protobuf's wire format: the fields of a message, and whole numbers (seven bits a byte, the lowest first), which
+TensorFlow's tables write likewise.
+"""
 
 from __future__ import annotations
 
-_MOST_BITS = 64
+from collections.abc import Iterator
+
+_MOST_BITS, _MOST = 64, (1 << 64) - 1
+#: Types of a field's content; between the tags of a group lie fields.
+VARINT, LONG, BYTES, GROUP, GROUP_END, SHORT = range(6)
+#: Bytes of a content that always has so many.
+_SIZES = {LONG: 8, SHORT: 4, GROUP: 0, GROUP_END: 0}
+
+
+class WireError(Exception):
+    """What lies there is no field."""
+
+
+class CutOffError(WireError):
+    """The bytes end within a number."""
+
+
+def message_fields(data: bytes | memoryview, at: int, end: int) -> Iterator[tuple[int, int, int, int]]:
+    """(tag, where that ends, where the content begins, where it ends) of each field of a message in ``data[at:end]``.
+
+    A content may be cut off: it then ends beyond ``end``, and is the last. Raises WireError at the first damage.
+    """
+    try:
+        while at < end:
+            tag = data[at]
+            tag_end = at + 1
+            if tag > 0x7F:
+                tag, tag_end = _number(data, at, end)
+            kind = tag & 7
+            start = tag_end
+            if kind == BYTES:
+                length = data[start]
+                start += 1
+                if length > 0x7F:
+                    length, start = _number(data, tag_end, end)
+                at = start + length
+            elif kind == VARINT:
+                at = start
+                while data[at] > 0x7F:
+                    at += 1
+                at += 1
+            elif kind in _SIZES:
+                at = start + _SIZES[kind]
+            else:
+                raise WireError
+            if tag <= 7:  # number 0
+                raise WireError
+            yield tag, tag_end, start, at
+    except IndexError:
+        raise CutOffError from None
+
+
+def _number(data: bytes | memoryview, at: int, end: int) -> tuple[int, int]:
+    """A number, of which protobuf in Python keeps the low bits; in C it refuses what is cut here."""
+    value, at = read_varint(data, at, end)
+    if value < 0:
+        raise CutOffError
+    return value & _MOST, at
 
 
 def read_varint(data: bytes | memoryview, at: int, end: int) -> tuple[int, int]:
