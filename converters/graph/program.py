@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter as Count
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from msgspec import Struct, field
@@ -276,18 +276,18 @@ def _join_once(program: Program) -> bool:
     readers = Count(p for s in program.stages for p in {e.tensor.place for e in elements(s.body)})
     kept_places = {t.place for t in program.outputs.values()}
     alone = {p: s for p, s in made.items() if readers[p] == 1 and p not in kept_places}
+    traits = {p: _traits_of(s.body) for p, s in made.items()}
     gone: set[Any] = set()
     for stage in program.stages:
         swap: dict[int, Expression] = {}
-        reducing, abouts, terms = _reduces(stage.body), list[str](), sum(1 for _ in every(stage.body))
-        for place, found in _reads(stage, alone).items():
-            before = alone[place]
-            if reducing and _reduces(before.body):
+        own, abouts = traits[stage.result.place], list[str]()
+        for place, found in _reads(stage, alone, own).items():
+            before, other = alone[place], traits[place]
+            if other.draws or split_loop(before, before.body) or (own.reduces and other.reduces):
                 continue
-            terms += sum(1 for _ in every(before.body))
-            if terms > MAX_TERMS:
+            if own.terms + other.terms > MAX_TERMS:
                 break
-            reducing = reducing or _reduces(before.body)
+            own = _Traits(own.terms + other.terms, own.reduces or other.reduces, own.draws)
             turned = {id(a): b for a, b in zip(before.counters, stage.counters, strict=True)}
             swap |= dict.fromkeys(map(id, found), inline_scalars(before.body, turned))
             gone.add(place)
@@ -295,31 +295,39 @@ def _join_once(program: Program) -> bool:
         if swap:
             stage.about = ", ".join([*abouts, stage.about])
             stage.body = inline_scalars(stage.body, swap)
+            traits[stage.result.place] = own
     program.stages = [s for s in program.stages if s.result.place not in gone]
     return bool(gone)
 
 
-def _is_whole(stage: Stage) -> bool:
-    """Whether a stage is one loop nest that gives the same wherever it runs."""
-    return not split_loop(stage, stage.body) and not any(isinstance(x, Drawn) for x in every(stage.body))
+class _Traits(NamedTuple):
+    """What decides whether an expression may be joined; kept, since a chain of ops would be walked again and again."""
+
+    terms: int
+    reduces: bool
+    draws: bool
 
 
-def _reads(stage: Stage, made: Mapping[Any, Stage]) -> dict[Any, list[Element]]:
+def _traits_of(x: Expression) -> _Traits:
+    terms = list(every(x))
+    return _Traits(
+        len(terms), any(isinstance(one, Reduced) for one in terms), any(isinstance(one, Drawn) for one in terms)
+    )
+
+
+def _reads(stage: Stage, made: Mapping[Any, Stage], own: _Traits) -> dict[Any, list[Element]]:
     """Place → where a stage reads it, of those that it reads element by element, each in its own loops."""
-    within = {id(e) for r in every(stage.body) if isinstance(r, Reduced) for e in every(r.body)}
+    terms = list(every(stage.body))
+    within = {id(e) for r in terms if isinstance(r, Reduced) for e in every(r.body)} if own.reduces else set()
     found: dict[Any, list[Element]] = {}
-    for e in elements(stage.body):
-        if e.tensor.place in made:
+    for e in terms:
+        if isinstance(e, Element) and e.tensor.place in made:
             found.setdefault(e.tensor.place, []).append(e)
     return {
         place: read
         for place, read in found.items()
-        if _is_whole(made[place]) and all(id(e) not in within and _same_place(e, made[place], stage) for e in read)
+        if all(id(e) not in within and _same_place(e, made[place], stage) for e in read)
     }
-
-
-def _reduces(x: Expression) -> bool:
-    return any(isinstance(one, Reduced) for one in every(x))
 
 
 def _same_place(e: Element, before: Stage, stage: Stage) -> bool:
