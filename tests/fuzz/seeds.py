@@ -225,6 +225,29 @@ def _keras() -> list[Files]:
     ]
 
 
+def _stored() -> list[Files]:
+    """The same models as Keras 2 writes them: one HDF5 file of configuration, lists of names and arrays."""
+    import h5py
+
+    found = []
+    for kind, config, shapes in _layered():
+        random, made = np.random.default_rng(0), io.BytesIO()
+        with h5py.File(made, "w") as file:
+            file.attrs["model_config"] = json.dumps({"class_name": kind, "config": config})
+            file.attrs["keras_version"] = "2.4.0"
+            root = file.create_group("model_weights")
+            layers = list(dict.fromkeys(name.partition("/")[0] for name in shapes))
+            root.attrs["layer_names"] = [layer.encode() for layer in layers]
+            for layer in layers:
+                own = [name for name in shapes if name.startswith(f"{layer}/")]
+                group = root.create_group(layer)
+                group.attrs["weight_names"] = [name.encode() for name in own]
+                for name in own:
+                    group[name] = random.standard_normal(shapes[name]).astype(np.float32)
+        found.append({"policy.h5": made.getvalue()})
+    return found
+
+
 def keras_3() -> dict[str, Any]:
     """A model of one layer as Keras 3 spells it."""
 
@@ -331,6 +354,7 @@ def _tables() -> Iterator[tuple[str, Reader]]:
     yield "VecNormalize", Reader(_normalised, changes.statistics, "policy.zip")
     yield "bundle", Reader(_bundles, changes.bundle, takes="bundle")
     yield "Keras", Reader(_keras, changes.keras_config, "policy.keras", takes="configuration")
+    yield "HDF5", Reader(_stored, changes.hdf5, "policy.h5", takes="stored")
     yield "recording", Reader(_recordings, changes.recording, takes="recording")
 
 
