@@ -1,13 +1,14 @@
-"""The core pages as a reader follows them: the wheel, an empty folder, ``demo --files``, then every block in order."""
+"""The core pages as a reader follows them: the wheel installed, an empty folder, then every block in order.
+
+The first of each page is ``demo --files``.
+"""
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
 import subprocess
 import sys
-import zipfile
 from pathlib import Path
 
 import pytest
@@ -44,39 +45,40 @@ def test_each_begins_with_the_files_to_try() -> None:
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with what the wheel holds, and the command that it installs."""
-    folder = tmp_path_factory.mktemp("wheel")
-    build = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", str(folder), str(ROOT)]
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The Python of an environment that pip installed the wheel into; its dependencies are the tests' own."""
+    home = tmp_path_factory.mktemp("installed")
+    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet"]
+    build = [*pip, "wheel", "--no-deps", "--wheel-dir", str(home), str(ROOT)]
     subprocess.run(build, check=True, capture_output=True)
-    with zipfile.ZipFile(next(folder.glob("*.whl"))) as archive:
-        archive.extractall(folder / "packages")
-    script = folder / "bin" / "export-model"
-    script.parent.mkdir()
-    script.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m exporter "$@"\n')
-    script.chmod(0o755)
-    return folder
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(home / "own")], check=True)
+    python = home / "own" / "bin" / "python"
+    (wheel,) = home.glob("*.whl")
+    install = [*pip, "--python", str(python), "install", "--no-deps", "--no-index", str(wheel)]
+    subprocess.run(install, check=True, capture_output=True)
+    packages = _packages(python)
+    # The .pth files in a folder that a .pth file names are not read, so the checkout stays out.
+    (packages / "dependencies.pth").write_text(f"{_packages(Path(sys.executable))}\n")
+    return python
+
+
+def _packages(python: Path) -> Path:
+    ask = [str(python), "-c", "import sysconfig; print(sysconfig.get_path('purelib'))"]
+    return Path(subprocess.run(ask, check=True, capture_output=True, encoding="utf-8").stdout.strip())
 
 
 class Reader(Workshop):
     """Somebody who has installed the wheel and pastes what the pages say."""
 
-    def __init__(self, folder: Path, wheel: Path) -> None:
-        super().__init__(folder)
-        self._wheel = wheel
-
     def _environment(self) -> dict[str, str]:
-        own = super()._environment()
-        packages = [str(NARROW), str(self._wheel / "packages")]
-        path = f"{self._wheel / 'bin'}{os.pathsep}{own['PATH']}"
-        return {**own, "PYTHONPATH": os.pathsep.join(packages), "PATH": path}
+        return {**super()._environment(), "PYTHONPATH": str(NARROW)}
 
 
 @pytest.mark.slow
-def test_every_block_runs_in_order(wheel: Path, tmp_path: Path) -> None:
+def test_every_block_runs_in_order(installed: Path, tmp_path: Path) -> None:
     folder = tmp_path / "empty"
     folder.mkdir()
-    reader = Reader(folder, wheel)
+    reader = Reader(folder, python=installed)
     if MODULES.is_dir():
         (tmp_path / "node_modules").symlink_to(MODULES)  # as npm leaves it, found from the folder below
     if shutil.which("gcc") is None and shutil.which("clang") is None:
@@ -88,14 +90,14 @@ def test_every_block_runs_in_order(wheel: Path, tmp_path: Path) -> None:
             count += block.language in LANGUAGES and block.verb != "skip"
     assert count > 25
     found = subprocess.run(
-        [sys.executable, "-c", "import exporter, export_model; print(exporter.__file__, export_model.__file__)"],
+        [str(installed), "-c", "import exporter, export_model; print(exporter.__file__, export_model.__file__)"],
         env=reader._environment(),
         cwd=folder,
         capture_output=True,
         encoding="utf-8",
         check=True,
     )
-    assert all(Path(place).is_relative_to(wheel) for place in found.stdout.split())
+    assert all(Path(place).is_relative_to(installed.parents[1]) for place in found.stdout.split())
 
 
 def test_all_pages_are_short_together() -> None:

@@ -69,8 +69,8 @@ def small_nn() -> bytes:
 class Workshop:
     """Runs the blocks of one page, one after the other, in one folder."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, python: Path = Path(sys.executable)) -> None:
+        self.folder, self.python = folder, python
         self.narrow = False
         self._programs = 0
         self._last = ""
@@ -92,7 +92,7 @@ class Workshop:
     def python(self, block: Block) -> None:
         text = f"{self._last}\n\n{block.text}" if block.verb == "continues" else block.text
         self._last = text
-        self._finished([sys.executable, self._program(text, "py")], block)
+        self._finished([str(self.python), self._program(text, "py")], block)
 
     def javascript(self, block: Block) -> None:
         node = shutil.which("node")
@@ -124,10 +124,9 @@ class Workshop:
         return name
 
     def _environment(self) -> dict[str, str]:
-        own = Path(sys.executable).parent
         return {
             **os.environ,
-            "PATH": f"{own}{os.pathsep}{os.environ['PATH']}",
+            "PATH": f"{self.python.parent}{os.pathsep}{os.environ['PATH']}",
             "PYTHONPATH": os.pathsep.join(map(str, (NARROW, *PLACES) if self.narrow else PLACES)),
             "GITHUB_STEP_SUMMARY": str(self.folder / "summary.md"),
             "TF_CPP_MIN_LOG_LEVEL": "3",
