@@ -90,9 +90,9 @@ def compile_options(read: ReadOptions, write: WriteOptions | None = None) -> Com
     """Return what the compiler needs of both. Raises UsageError."""
     write = write or WriteOptions()
     if write.names not in ("canonical", "source"):
-        raise UsageError(f"names={write.names!r}", fix="one of: canonical, source")
+        raise UsageError(f"names={write.names!r}: must be canonical or source")
     if write.noise not in _NOISE:
-        raise UsageError(f"noise={write.noise!r}", fix="one of: lift, keep, zero")
+        raise UsageError(f"noise={write.noise!r}: must be lift, keep or zero")
     return CompileOptions(
         names=write.names,
         noise=_NOISE[write.noise],

@@ -49,7 +49,7 @@ def code_options(
     options = CodeOptions(math, weights, outputs, guard)
     for key, words in CHOICES.items():
         if getattr(options, key) not in words:
-            raise UsageError(f"--{key} {getattr(options, key)}", fix=f"one of: {', '.join(words)}")
+            raise UsageError(f"--{key} {getattr(options, key)}: must be {' or '.join(words)}")
     if guard is not None and not (numbers.isfinite(guard) and guard > 0):
         raise UsageError(f"--guard {guard:g}", fix="give a number of standard deviations, such as 6")
     return options

@@ -91,10 +91,8 @@ def whole(name: str, value: object, least: int, most: int | None = None) -> int:
     except TypeError:
         number = least - 1
     if isinstance(value, bool) or number < least or (most is not None and number > most):
-        fix = (
-            f"give a whole number of {least} or more" if most is None else f"give a whole number from {least} to {most}"
-        )
-        raise UsageError(f"{name} is {value}", fix=fix)
+        bounds = f"of {least} or more" if most is None else f"from {least} to {most}"
+        raise UsageError(f"{name} {value}: must be a whole number {bounds}")
     return number
 
 

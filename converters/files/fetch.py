@@ -180,7 +180,7 @@ def _missing(path: Path) -> SourceError:
     """There is no such file; an address is none."""
     address = address_of(path)
     if address is None:
-        return SourceError("no such file", where=str(path), fix=_neighbours(path))
+        return SourceError("no such file", where=str(path), fix=neighbours(path))
     fix = "download it (the raw file, not the page that shows it), and give the file"
     known = address.partition("://")[0] in FETCHED
     return SourceError(
@@ -217,7 +217,8 @@ def fetches() -> bool:
         return False
 
 
-def _neighbours(path: Path) -> str:
+def neighbours(path: Path) -> str:
+    """What to do where nothing lies at a path: the name that is nearest to its own in that folder."""
     try:
         names = sorted(p.name for p in path.parent.iterdir())
     except OSError:  # there is no such folder, or it may not be listed

@@ -50,7 +50,7 @@ def load_as(
     from converters.formats.source import ReadOptions
 
     if runtime not in (None, *RUNTIMES):
-        raise UsageError(f"runtime={runtime!r}", fix=f"one of: {', '.join(RUNTIMES)}")
+        raise UsageError(f"runtime={runtime!r}: must be one of {', '.join(RUNTIMES)}")
     if path.is_dir() and (path / POLICY).exists():
         if compiling.brain is not None:
             raise UsageError(f"brain={compiling.brain!r}", why="a bundle holds one policy", fix="leave brain out")

@@ -9,7 +9,6 @@ import click
 from exporter.cli.group import PATH, command
 from exporter.cli.options import one_bundle
 from exporter.cli.terminal import say
-from signatures.errors import UsageError
 
 
 @command(
@@ -25,12 +24,5 @@ def card_command(bundle: Path) -> None:
     """
     from converters.files.fetch import path_text
     from exporter.card.card import write_card
-    from exporter.tables import command_text
 
-    place = one_bundle(bundle, "card")
-    if place is None and bundle.exists():
-        raise UsageError(
-            f"{bundle} is not a bundle",
-            fix=f"{command_text(bundle, '-o', 'exported')}    (then: export-model card exported)",
-        )
-    say(f"wrote {path_text(write_card(place or bundle))}")
+    say(f"wrote {path_text(write_card(one_bundle(bundle, 'card')))}")

@@ -50,8 +50,11 @@ class Console(Struct, frozen=True):
         if not self.wants_reports:
             return
         if not verifies:
+            asked = {"--junit": self.junit, "--markdown": self.markdown, "--html": self.html}
             raise UsageError(
-                "a report needs a verification", why="--verify none was given", fix="leave one of them out"
+                f"{', '.join(option for option, given in asked.items() if given is not None)} needs a verification",
+                why="--verify none was given",
+                fix="leave one of them out",
             )
         from exporter.reports.write import Destinations
 

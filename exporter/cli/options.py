@@ -13,7 +13,7 @@ from click.core import ParameterSource
 
 from exporter.cli.console import Console
 from exporter.cli.group import FILE
-from signatures.errors import UsageError
+from signatures.errors import UsageError, suggestion
 
 if TYPE_CHECKING:
     from converters.formats.source import ReadOptions
@@ -30,8 +30,8 @@ def pairs(values: Sequence[str], flag: str) -> dict[str, str]:
     return found
 
 
-def one_bundle(place: Path, command: str) -> Path | None:
-    """The bundle at ``place``, or the only one in that folder; None where there is none. Raises UsageError."""
+def one_bundle(place: Path, command: str) -> Path:
+    """The bundle at ``place``, or the only one in that folder; else the place itself. Raises UsageError for several."""
     from converters.formats.bundle.bundle import bundles_in
     from exporter.tables import command_text
 
@@ -41,7 +41,7 @@ def one_bundle(place: Path, command: str) -> Path | None:
         raise UsageError(
             f"{place} holds {len(found)} bundles", why=names, fix=f"choose one: {command_text(command, found[0])}"
         )
-    return found[0] if found else None
+    return found[0] if found else place
 
 
 def as_given(names: Container[str]) -> list[str]:
@@ -222,7 +222,8 @@ def _required_formats(given: str | None, *, unverified: bool) -> tuple[str, ...]
     wrong = next((word for word in wanted if word != "all" and word not in WRITTEN), None)
     if wrong is not None or not wanted:
         raise UsageError(
-            f"--require {given}: {wrong or 'nothing'} is not a format", fix=f"all, or {', '.join(WRITTEN)}"
+            f"--require {given}: must name formats",
+            fix=f"{suggestion(wrong or '', WRITTEN)}all, or {', '.join(WRITTEN)}",
         )
     if unverified:
         raise UsageError(f"--require {given} needs a verification", fix="leave --allow-unverified or --verify none out")

@@ -107,9 +107,11 @@ def _gallery(folders: Sequence[Path], out: Path | None, scene: str, host: str, p
 @contextmanager
 def _bundle_of(place: Path) -> Iterator[Path]:
     """The bundle at ``place``; a source is exported into a folder that lasts as long as the context."""
+    from signatures.contract import POLICY  # it loads numpy
+
     found = one_bundle(place, "serve")
-    if found is not None or not place.exists():
-        yield found or place
+    if (found / POLICY).is_file() or not place.exists():
+        yield found
         return
     from converters.files.folders import scratch_folder
     from exporter.export.options import ExportOptions

@@ -25,7 +25,7 @@ def snippets_command(bundle: Path | None, target: str | None, as_json: bool) -> 
     """Code to copy: how to call this policy from Python, TF Serving, JavaScript, C# and Unity."""
     from exporter.snippets.contract import read_bundle
     from exporter.snippets.registry import TARGETS, snippets
-    from exporter.tables import command_text, table
+    from exporter.tables import table
 
     if target == "help":
         rows = [[t.name, t.title, t.formats_text] for t in TARGETS]
@@ -36,13 +36,7 @@ def snippets_command(bundle: Path | None, target: str | None, as_json: bool) -> 
         return
     if bundle is None:
         raise UsageError("no bundle was given", fix="export-model snippets exported/3DBall")
-    place = one_bundle(bundle, "snippets")
-    if place is None and bundle.exists():
-        raise UsageError(
-            f"{bundle} is not a bundle",
-            fix=f"{command_text(bundle, '-o', 'exported')}    (then: export-model snippets exported)",
-        )
-    found = read_bundle(place or bundle)
+    found = read_bundle(one_bundle(bundle, "snippets"))
     made, lacking = snippets(found, target)
     if as_json:
         say_json({"policy": found.name, "snippets": [s.to_dict() for s in made], "left_out": lacking})

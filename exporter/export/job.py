@@ -215,7 +215,9 @@ def check_batch(options: ExportOptions, formats: Sequence[Format]) -> None:
     if options.batch is None:
         return
     if not 0 < options.batch <= MOST_AGENTS:
-        raise UsageError(f"--batch {options.batch}", why="it is how many agents act at once", fix=f"1 to {MOST_AGENTS}")
+        raise UsageError(
+            f"--batch {options.batch}: must be from 1 to {MOST_AGENTS}", why="it is how many agents act at once"
+        )
     if options.profile is not None:
         raise UsageError(
             f"--batch does not go with --for {options.profile}",

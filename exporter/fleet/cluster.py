@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import re
 import threading
 import time
 import uuid
@@ -30,7 +31,7 @@ from exporter.export.names import Claim, Claimed, Turns
 from exporter.export.options import ExportOptions
 from exporter.export.pipeline import Exporter
 from exporter.fleet.worker import Outcome, Wanted, export_source
-from signatures.errors import RuntimeUnavailableError, SourceError
+from signatures.errors import RuntimeUnavailableError, SourceError, UsageError
 
 #: Seconds in which a scheduler answers.
 _PATIENCE = 15
@@ -268,6 +269,8 @@ def _dask(address: str) -> Any:
 
 
 def _connect(address: str) -> Any:
+    if re.search(r":\d{1,5}/?$", address) is None:  # Dask would look for it for half a minute
+        raise UsageError(f"--cluster {address}: must be an address with a port", fix="--cluster tcp://HOST:8786")
     try:
         client = _dask(address).Client(address, timeout=_PATIENCE, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:  # the last where tls:// lacks its settings

@@ -51,7 +51,7 @@ def export_fleet(
     RuntimeUnavailableError before the first source is read; what becomes of a source is in its Outcome.
     """
     if jobs < 1:
-        raise UsageError(f"--jobs {jobs}", fix="give 1 or more")
+        raise UsageError(f"--jobs {jobs}: must be 1 or more", fix="leave it out: one at a time")
     if options.name is not None and len(paths) > 1:
         raise UsageError("--name goes with a single policy", fix="export one source, or leave --name out")
     wanted = wanted or Wanted()

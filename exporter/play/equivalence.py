@@ -57,7 +57,7 @@ def parse_margin(text: str) -> Margin:
     value = float(found[1]) if found else 0.0
     if found is None or not 0 < value < math.inf:
         raise UsageError(
-            f"margin {text!r}: must be a share such as 1%, or a positive number in the unit of returns",
+            f"--margin {text}: must be a share such as 1%, or a positive number in the unit of returns",
             fix="give for example --margin 1%",
         )
     return Margin(value / 100, True) if found[2] else Margin(value, False)

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from exporter.play.worlds import MakeWorld, Outcome, View
-from signatures.errors import UsageError
+from signatures.errors import UsageError, suggestion
 from signatures.roles import Role
 from signatures.spec import PolicySignature, TensorSpec
 
@@ -192,19 +192,20 @@ def _fit_shape(spec: TensorSpec, array: Array) -> Array | None:
 
 def gymnasium_maker(env: str, known: Sequence[str]) -> MakeWorld:
     """Return what makes worlds of a Gymnasium id. Raises UsageError where Gymnasium is not installed, or has none."""
+    ours = f"one of {', '.join(known)}"
     try:
         gymnasium: Any = importlib.import_module("gymnasium")
     except ModuleNotFoundError as error:
         raise UsageError(
             f"--env {env}: unknown environment",
             why="Gymnasium, which may have one of that name, is not installed",
-            fix=f"one of {', '.join(known)}; a Gymnasium id after pip install 'export-model[gym]'; or module:make",
+            fix=f"{suggestion(env, known)}{ours}; a Gymnasium id after pip install 'export-model[gym]'; or module:make",
         ) from error
     if env not in gymnasium.registry:
         raise UsageError(
             f"--env {env}: unknown environment",
             why="Gymnasium has none of that name either",
-            fix=f"one of {', '.join(known)}, a Gymnasium id such as CartPole-v1, or module:make",
+            fix=f"{suggestion(env, [*known, *gymnasium.registry])}{ours}, a Gymnasium id, or module:make",
         )
     # Its checker looks at every step of every episode, which takes a third of the time.
     return lambda signature: GymnasiumWorld(env, lambda: gymnasium.make(env, disable_env_checker=True), signature)

@@ -21,7 +21,7 @@ def test_what_a_bundle_has_not_is_left_out_or_refused(tmp_path: Path) -> None:
     assert "(--for tensorflowsharp)" in ran.out
     is_refused(run("snippets", result.folder, "--for", "onnxruntime"), "has no onnx", "fix")
     is_refused(run("snippets", result.folder, "--for", "swift"), "unknown target", "onnxruntime")
-    is_refused(run("snippets", tmp_path / "none"), "not a bundle")
+    is_refused(run("snippets", tmp_path / "none"), "no such folder")
 
 
 def test_a_recurrent_policy_with_the_nodes_of_its_trainer_runs_in_unity(tmp_path: Path) -> None:

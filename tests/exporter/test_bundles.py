@@ -235,9 +235,10 @@ def test_a_bundle_that_was_not_touched_is_whole(ball: Path) -> None:
 
 def test_a_folder_without_a_contract_is_no_bundle(tmp_path: Path) -> None:
     is_no_bundle(tmp_path, tmp_path, "not a bundle", "policy.json")
-    is_no_bundle(tmp_path / "nothing", "not a bundle")
+    is_no_bundle(tmp_path / "nothing", "no such folder", "check the path")
     (tmp_path / "file").write_text("x")
-    is_no_bundle(tmp_path / "file", tmp_path / "file")
+    is_no_bundle(tmp_path / "file", tmp_path / "file", "a file, not a bundle", "-o exported")
+    is_no_bundle(tmp_path / "fil", f"did you mean {tmp_path / 'file'}?")
 
 
 @pytest.mark.parametrize("text", ["", "{", "nonsense", "[" * 100_000, '{"schema": 1', "\x00"])

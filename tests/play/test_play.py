@@ -205,7 +205,7 @@ def test_not_decided_is_a_failure_only_with_strict(bundles: Path, monkeypatch: p
         (("--env", "nowhere"), "unknown environment"),
         (("--env", "GridWorld", "--episodes", "19"), "whole number from 20"),
         (("--env", "GridWorld", "--margin", "0"), "must be a share"),
-        (("--env", "GridWorld", "--seed", "-1"), "seed is -1"),
+        (("--env", "GridWorld", "--seed", "-1"), "seed -1: must be a whole number"),
         (("--env", "GridWorld", "--verify", "none"), "nothing that plays"),
         ((), "--env"),
     ],

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import json
+import shlex
 import stat
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import Any, TypeAlias
 from msgspec import Struct
 from msgspec.structs import replace
 
-from converters.files.fetch import inside
+from converters.files.fetch import inside, neighbours, path_text
 from converters.formats.bundle.embed import contract_text, without_contract
 from converters.formats.bundle.exchange import exchange, recover, stage
 from converters.formats.format import Artifact, Format
@@ -71,12 +72,7 @@ class Bundle(Struct, frozen=True):
             content = json_of(path.read_bytes())
             contract = parse(content)
         except (FileNotFoundError, NotADirectoryError) as error:
-            raise BundleError(
-                "not a bundle",
-                where=str(folder),
-                why=f"it has no {POLICY}",
-                fix="give the folder that export-model wrote",
-            ) from error
+            raise _no_bundle(folder) from error
         except OSError as error:
             raise unfit(path, "cannot be read", error.strerror) from error
         except FieldError as error:
@@ -207,6 +203,18 @@ def declared_by(graph: Graph) -> Declared:
 
 def _goes(axes: Sequence[int | None], wanted: Sequence[int | None]) -> bool:
     return len(axes) == len(wanted) and all(a == b or None in (a, b) for a, b in zip(axes, wanted, strict=True))
+
+
+def _no_bundle(folder: Path) -> BundleError:
+    """Say what there is where no contract lies: nothing, a file, or a folder of something else."""
+    if not folder.exists():
+        return BundleError("no such folder", where=str(folder), fix=neighbours(folder))
+    return BundleError(
+        "a file, not a bundle" if folder.is_file() else "not a bundle",
+        where=str(folder),
+        why=f"a bundle is a folder with a {POLICY}",
+        fix=f"export-model {shlex.quote(path_text(folder))} -o exported    (then give the folder that it writes there)",
+    )
 
 
 def dumps(content: Mapping[str, Any]) -> bytes:
