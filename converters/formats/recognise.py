@@ -144,7 +144,10 @@ def _nothing_in(folder: Path) -> SourceError:
     if nested:
         fix = f"give one of the folders in it: {', '.join(map(str, nested[:5]))}" + (", …" if nested[5:] else "")
     elif any(n.startswith("rllib_checkpoint.") for n in inside):
-        fix = "it is a checkpoint of RLlib: load it there, export its module (torch.onnx.export), and give the .onnx"
+        fix = (
+            "it is a checkpoint of RLlib without rl_module/<name>/module_state.pkl (the old API stack, or another "
+            "framework): load it there, export its module (torch.onnx.export), and give the .onnx"
+        )
     else:
         fix = "give a run's folder (models/<run>, results/<run>), a SavedModel, a TensorFlow.js model, or a model file"
     return SourceError(

@@ -21,6 +21,7 @@ ROOMS = (
     "csharp",
     "js",
     "stable_baselines3",
+    "rllib",
     "torchscript",
     "torch_checkpoint",
     "keras",

@@ -12,20 +12,20 @@ from signatures.errors import NotAPolicyError
 
 #: Rooms of ``converters/trainers``, in the order in which they are asked.
 ROOMS = (
+    "rllib",
     "stable_baselines3",
     "mlagents",
     "rsl_rl",
     "rl_games",
     "skrl",
+    "sample_factory",
     "cleanrl",
 )
 TRAINERS: tuple[Trainer, ...] = tuple(importlib.import_module(f"converters.trainers.{room}").TRAINER for room in ROOMS)
-#: How a tensor's name begins in the checkpoints of trainers whose networks are not rebuilt (Tianshou 2, RLlib 2,
-#: Sample Factory 2).
+#: How a tensor's name begins in the checkpoints of trainers whose networks are not rebuilt (Tianshou 2, RLlib 2).
 _OTHERS: Mapping[str, str] = {
     **dict.fromkeys(("actor.preprocess.", "model.model.model."), "Tianshou"),
     **dict.fromkeys(("encoder.actor_encoder.", "_logits._model.", "_hidden_layers.0._model."), "RLlib"),
-    "action_parameterization.": "Sample Factory",
 }
 
 

@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from converters.files.fetch import Fetched
+from converters.files.file_probe import json_in
 from converters.files.yaml_data import MAX_YAML_BYTES, read_yaml
 from converters.graph.nn.activations import Activation
 from converters.trainers.pytorch.activations import activation_named
 from signatures.errors import SourceError
 
 #: Folders of a run that hold its checkpoints alone: the settings lie one folder up.
-_OF_CHECKPOINTS = re.compile("nn|checkpoints")
+_OF_CHECKPOINTS = re.compile(r"nn|checkpoints|checkpoint_p\d+")
 MAX_LAYERS = 64
 #: Numbers that a layer gives.
 MAX_UNITS = 1 << 16
@@ -113,6 +114,16 @@ def _is_size(value: object, least: int = 1) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and least <= value <= MAX_UNITS
 
 
+def _json_values(data: bytes, name: str) -> Any:
+    """Return what JSON says, which takes no PyYAML. Raises SourceError."""
+    try:
+        return json_in(data)
+    except (ValueError, RecursionError) as error:
+        raise SourceError(
+            f"{name} is not JSON", why=str(error)[:200], fix="give the file that the training wrote"
+        ) from error
+
+
 def find_settings(given: Fetched, names: Sequence[str], keys: Sequence[str]) -> tuple[Settings, Path] | None:
     """Return the first file of these names that has one of ``keys`` at its top, and its path; None where none has.
 
@@ -128,7 +139,8 @@ def find_settings(given: Fetched, names: Sequence[str], keys: Sequence[str]) -> 
                     continue
             except OSError:
                 continue
-            values = read_yaml(given.bytes_of(file, empty=True), name)
-            if isinstance(values, dict) and any(isinstance(values.get(key), dict) for key in keys):
+            data = given.bytes_of(file, empty=True)
+            values = _json_values(data, name) if name.endswith(".json") else read_yaml(data, name)
+            if isinstance(values, dict) and any(isinstance(values.get(key), dict | list) for key in keys):
                 return Settings(values, name), file
     return None

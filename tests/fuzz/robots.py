@@ -41,7 +41,7 @@ def runs() -> list[Files]:
     for settings in sorted(FOLDER.glob("*.yaml")):
         with tempfile.TemporaryDirectory() as folder:
             path = checkpoint(Path(folder), settings.stem, "policy.pt", "agent.yaml")
-            found.append({name: (path.parent / name).read_bytes() for name in ("policy.pt", "agent.yaml")})
+            found.append({file.name: file.read_bytes() for file in sorted(path.parent.iterdir())})
     return found
 
 
@@ -50,7 +50,8 @@ def change_run(files: Files, random: Random) -> Files:
     draw = random.random()
     if draw < 0.3:
         return {**files, **changes.pickled({"policy.pt": files["policy.pt"]}, random)}
-    data = files["agent.yaml"]
+    (name,) = (n for n in files if n != "policy.pt")
+    data = files[name]
     if draw < 0.8:
         tree = mutation.json_tree(yaml.safe_load(data), random)
         changed = json.dumps(tree).encode("utf-8", "surrogatepass")
@@ -59,7 +60,7 @@ def change_run(files: Files, random: Random) -> Files:
         changed = data[:at] + random.choice(_PIECES) + data[at + random.randrange(3) :]
     else:
         changed = mutation.damaged(data, random)
-    return {**files, "agent.yaml": changed}
+    return {**files, name: changed}
 
 
 def saved_policies() -> list[Files]:

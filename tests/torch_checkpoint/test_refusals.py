@@ -47,7 +47,6 @@ def image(folder: Path, name: str) -> Path:
         ({"model.model.model.0.weight": None}, "Tianshou"),
         ({"encoder.actor_encoder.net.mlp.0.weight": None}, "RLlib"),
         ({"_logits._model.0.weight": None, "_hidden_layers.0._model.0.weight": None}, "RLlib"),
-        ({"model": ["core.core.weight_ih_l0", "action_parameterization.distribution_linear.weight"]}, "Sample Factory"),
     ],
 )
 def test_checkpoints_of_other_trainers_are_named(

@@ -42,7 +42,8 @@ def test_acts_as_the_trainers_own_player(name: str, tmp_path: Path) -> None:
     memory = inputs.get(Role.MEMORY_IN)
     state = None if memory is None else np.zeros((ROWS, *memory.shape[1:]), np.float32)
     for step in range(STEPS):
-        feeds = {s.name: golden["in/obs"][step] for r, s in inputs.items() if r in (Role.VECTOR, Role.VISUAL)}
+        seen = policy.signature.observations
+        feeds = {s.name: golden[f"in/{'obs' if len(seen) == 1 else s.source}"][step] for s in seen}
         feeds |= {s.name: np.zeros((ROWS, *s.shape[1:]), np.float32) for r, s in inputs.items() if r is Role.NOISE}
         if Role.MASKS in inputs:
             feeds[inputs[Role.MASKS].name] = golden["in/action_masks"][step]
@@ -52,7 +53,7 @@ def test_acts_as_the_trainers_own_player(name: str, tmp_path: Path) -> None:
         wanted = golden["deterministic_action"][step]
         assert answers[act].reshape(wanted.shape) == pytest.approx(wanted, abs=2e-6, rel=2e-5), step
         state = None if memory is None else answers[outputs[Role.MEMORY_OUT]]
-        for output in golden.keys() - {"in/obs", "in/action_masks", "deterministic_action"} if step == 0 else ():
+        for output in {n for n in golden if not n.startswith("in/")} - {"deterministic_action"} if step == 0 else ():
             assert answers[output] == pytest.approx(golden[output], abs=5e-6, rel=2e-5), output
 
 
@@ -189,6 +190,100 @@ def test_a_checkpoint_of_skrl_1_calls_observations_states(tmp_path: Path) -> Non
 def test_a_checkpoint_of_skrl_without_settings_names_what_is_missing(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match=r"its agent\.yaml is missing(?s:.*)a class of its own"):
         read_source(checkpoint(tmp_path, "skrl_ppo", settings=""))
+
+
+# ------------------------------------------------------------------ Sample Factory
+
+
+@pytest.mark.parametrize(
+    ("change", "value", "message"),
+    [
+        (("encoder_mlp_layers",), [12], r"and \[\?, 12\] fits"),
+        (("encoder_mlp_layers",), [], "encoder_mlp_layers must have a layer"),
+        (("encoder_mlp_layers",), [9, 12], r"and \[9, 6\] fits"),
+        (("nonlinearity",), "cube", "'cube', which is not an activation"),
+        (("normalize_input",), False, "normalize_input is false, and the checkpoint has statistics"),
+        (("use_rnn",), True, "has no core.core.weight_hh_l0"),
+        (("actor_critic_share_weights",), False, "must have a layer for each observation"),
+        (("obs_scale",), 0, "obs_scale must not be 0"),
+        (("decoder_mlp_layers",), [4], "has no decoder.mlp.0.weight"),
+    ],
+)
+def test_settings_of_sample_factory_that_do_not_fit_are_refused(
+    change: tuple[str, ...], value: Any, message: str, tmp_path: Path
+) -> None:
+    path = checkpoint(tmp_path, "sample_factory_mlp")
+    file = tmp_path / "run/config.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), change[0]: value}))
+    with pytest.raises(SourceError, match=message):
+        read_source(path)
+
+
+def test_sample_factory_without_settings_or_a_deviation_of_its_own_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match=r"its config\.json is missing"):
+        read_source(checkpoint(tmp_path, "sample_factory_mlp", settings=""))
+    path, writer = checkpoint(tmp_path, "sample_factory_mlp"), Writer()
+    state = states("sample_factory_mlp")["model"]
+    del state["action_parameterization.learned_stddev"]
+    path.write_bytes(writer.zip({"model": writer.state(state)}))
+    with pytest.raises(SourceError, match="its 3 numbers for actions may be of one choice, of several"):
+        read_source(path)
+
+
+# ------------------------------------------------------------------ RLlib
+
+
+def test_modules_of_rllib_are_found_in_a_checkpoint(tmp_path: Path) -> None:
+    module = checkpoint(tmp_path, "rllib_box")
+    (module.parent / "other").mkdir()
+    for file in module.iterdir():
+        (module.parent / "other" / file.name).write_bytes(file.read_bytes())
+    found = read_source(tmp_path / "run").policies()
+    assert [p.name for p in found] == ["default_policy", "other"]
+
+
+def changed_pickle(folder: Path, name: str, file: str, old: bytes, new: bytes) -> Path:
+    """A module of RLlib with other bytes of the same length in one of its pickles."""
+    module = checkpoint(folder, name)
+    data = (module / file).read_bytes()
+    assert len(old) == len(new) and old in data
+    (module / file).write_bytes(data.replace(old, new))
+    return module
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "message"),
+    [
+        ("box", b"DefaultPPOTorchRLModule", b"DefaultBCTorchRLModuleX", "its module is DefaultBCTorchRLModuleX, which"),
+        ("box", b"\x8c\x04tanh", b"\x8c\x04cube", r"model_config\.fcnet_activation is 'cube'"),
+        ("box", b"\x8c\x03Box", b"\x8c\x03Bag", "its space of actions is Bag"),
+        ("box", b"model_config", b"model_konfig", "has no model_config"),
+        ("lstm", b"use_lstm\x94\x88", b"use_lstm\x94\x89", r"has no encoder\.encoder\.net\.mlp\.0\.weight"),
+        ("box", b"use_lstm\x94\x89", b"use_lstm\x94\x88", r"has no encoder\.encoder\.tokenizer\.net\.mlp\.0"),
+        ("branches", b"nvec", b"nvek", "nvec"),
+    ],
+)
+def test_modules_of_rllib_that_are_not_known_are_refused(
+    name: str, old: bytes, new: bytes, message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(SourceError, match=message):
+        read_source(changed_pickle(tmp_path, f"rllib_{name}", "class_and_ctor_args.pkl", old, new))
+
+
+def test_a_module_of_rllib_without_its_arguments_names_what_is_missing(tmp_path: Path) -> None:
+    module = checkpoint(tmp_path, "rllib_box")
+    (module / "class_and_ctor_args.pkl").unlink()
+    with pytest.raises(SourceError, match=r"its class_and_ctor_args\.pkl is missing"):
+        read_source(module)
+
+
+@pytest.mark.parametrize("file", ["module_state.pkl", "class_and_ctor_args.pkl"])
+def test_a_pickle_of_rllib_that_acts_on_the_machine_does_nothing(file: str, tmp_path: Path) -> None:
+    proof, module = tmp_path / "ran", checkpoint(tmp_path, "rllib_box")
+    (module / file).write_bytes(pickle.dumps({"x": Command(f"touch {proof}")}))
+    with pytest.raises(SourceError, match=r"asks for (posix|os)\.system"):
+        read_source(module)
+    assert not proof.exists()
 
 
 # ------------------------------------------------------------------ SBX

@@ -1,4 +1,4 @@
-"""PyTorch checkpoints (``.pt``): of ML-Agents, rsl_rl, rl_games, skrl, CleanRL."""
+"""PyTorch checkpoints (``.pt``): of ML-Agents, rsl_rl, rl_games, skrl, Sample Factory, CleanRL."""
 
 from __future__ import annotations
 
