@@ -62,6 +62,8 @@ class Language(ABC):
     functions: Mapping[str, str] = {}
     #: Products that are added in one statement, in their order: more where a compiler keeps sums in memory between two.
     terms = 1
+    #: Whether constants are read in blocks (``converters.graph.blocks``).
+    blocks = False
 
     def __init__(self, own: bool = False) -> None:
         self.helpers: dict[str, str] = {}
@@ -98,6 +100,14 @@ class Language(ABC):
     @abstractmethod
     def draw(self) -> str:
         """The next number of the stream of draws."""
+
+    def block(self, name: str, packed: str, at: str) -> str:
+        """The declaration of the block of an array that is next, where ``blocks``."""
+        raise NotImplementedError
+
+    def in_block(self, name: str, number: int) -> str:
+        """A number of a block, where ``blocks``."""
+        raise NotImplementedError
 
     def round_to(self, text: str, x: Applied) -> str:
         """What an operator gives, in the precision of its dtype."""

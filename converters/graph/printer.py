@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from converters.graph.blocks import LANES, TERMS, Packed, packed_in, stride_of
 from converters.graph.language import Language, bare, comment, identifier
 from converters.graph.nodes import NameScope
 from converters.graph.ops.loops.base import Applied, Counter, Drawn, Element, Expression, Given, Number, Reduced, Tensor
@@ -34,6 +35,8 @@ class Printer:
     def __init__(self, language: Language, weight: str, taken: Sequence[str] = ()) -> None:
         self.language = language
         self.draws = self.looks_up = False
+        #: constants that are read in blocks, by name
+        self.packed: dict[str, Packed] = {}
         self._weight = weight
         self._taken = taken
         self._scope = NameScope(taken)
@@ -113,22 +116,22 @@ class Printer:
     def _lanes(self, stage: Stage, body: Expression, summed: Reduced) -> None:
         """Some elements of the last axis side by side, then, in place, what is made of each."""
         counter, outer = stage.counters[-1], dict(self._counters)
-        step = min(_LANES, counter.length)
-        whole = counter.length // step * step
-        if whole > step:
-            self._open(counter, 0, whole, step)
-            self._block(stage, summed, self._counters[id(counter)], step)
+        packed = packed_in(summed, counter) if self.language.blocks else None
+        first = 0
+        for step in (*((LANES,) if packed else ()), min(_LANES, counter.length), 1):
+            step = step if step > 1 else counter.length - first
+            last = counter.length - (counter.length - first) % (step or 1)
+            if first == last:
+                continue
+            if last - first > step:
+                self._open(counter, first, last, step)
+            else:
+                self._say("{")
+                self._depth += 1
+            base = self._counters[id(counter)] if last - first > step else str(first)
+            self._block(stage, summed, base, step, packed if step == LANES else None)
             self._close()
-        else:
-            self._say("{")
-            self._depth += 1
-            self._block(stage, summed, "0", step)
-            self._close()
-        if whole < counter.length:
-            self._say("{")
-            self._depth += 1
-            self._block(stage, summed, str(whole), counter.length - whole)
-            self._close()
+            first = last
         self._counters = outer
         if body is not summed:
             inner = inline_scalars(body, {id(summed): Element(stage.result, stage.at)})
@@ -136,7 +139,14 @@ class Printer:
             self._assign(stage, inner)
             self._close()
 
-    def _block(self, stage: Stage, summed: Reduced, base: str, count: int) -> None:
+    def _block(
+        self,
+        stage: Stage,
+        summed: Reduced,
+        base: str,
+        count: int,
+        packed: tuple[Packed, Element, Reduced] | None = None,
+    ) -> None:
         """So many elements of the last axis, from ``base`` on."""
         counter = stage.counters[-1]
         indices = [_plus(base, i) for i in range(count)]
@@ -146,19 +156,28 @@ class Printer:
         rest = "".join(f", {name} = {start}" for name in names[1:])
         self._say(self.language.declaration(summed.dtype, names[0], f"{start}{rest}", constant=False))
         outer, last = summed.counters[:-1], summed.counters[-1]
+        at = self._begin_blocks(packed[0], base) if packed else ""
         for each in outer:
             self._open(each, 0, each.length)
-        terms = self.language.terms if summed.kind == "sum" else 1
+        terms = TERMS if packed else self.language.terms if summed.kind == "sum" else 1
         whole = last.length // terms * terms
+        lanes = dict(zip(names, indices, strict=True))
+
+        def add(count: int) -> None:
+            if packed:
+                self._terms(packed[2], counter, lanes, count, (packed[1], self._next_block(packed[0], at)))
+            else:
+                self._terms(summed, counter, lanes, count)
+
         if whole:
             self._open(last, 0, whole, terms)
-            self._terms(summed, counter, dict(zip(names, indices, strict=True)), terms)
+            add(terms)
             self._close()
         if whole < last.length:
             self._counters[id(last)] = str(whole)
             self._say("{")
             self._depth += 1
-            self._terms(summed, counter, dict(zip(names, indices, strict=True)), last.length - whole)
+            add(last.length - whole)
             self._close()
         for _ in outer:
             self._close()
@@ -166,8 +185,35 @@ class Printer:
         for name, text in zip(names, self._neighbours(Element(stage.result, stage.at), count, {}, {}), strict=True):
             self._say(f"{text} = {name};")
 
-    def _terms(self, summed: Reduced, counter: Counter, lanes: Mapping[str, str], count: int) -> None:
-        """Keep so many elements of a reduction's last axis, for each lane (what keeps it, and its index), in order."""
+    def _begin_blocks(self, packed: Packed, base: str) -> str:
+        """Where the blocks begin that sums from ``base`` on read."""
+        at = self._locals.fresh("at")
+        blocks = f"{base} / {LANES} * {packed.of_a_lane}" if not base.isdecimal() else "0"
+        self._say(self.language.declaration(INT32, at, blocks, constant=False))
+        return at
+
+    def _next_block(self, packed: Packed, at: str) -> str:
+        """What the next block is called."""
+        name = f"{self.name(packed.place)}_blocks"
+        same = (n for n, known in self.packed.items() if known == packed)
+        wish = next(same, None) or self._scope.fresh(name)
+        self.packed[wish] = packed
+        block = self._locals.fresh("block")
+        self._say(self.language.block(block, wish, at))
+        return block
+
+    def _terms(
+        self,
+        summed: Reduced,
+        counter: Counter,
+        lanes: Mapping[str, str],
+        count: int,
+        block: tuple[Element, str] | None = None,
+    ) -> None:
+        """Keep so many elements of a reduction's last axis, for each lane (what keeps it, and its index), in order.
+
+        One that is read may come from a ``block``.
+        """
         last, shared = summed.counters[-1], _count_reads(summed)
         base, rows = self._counters[id(last)], dict[str, list[str]]()
         first: dict[int, str] = {}
@@ -184,8 +230,11 @@ class Printer:
                 self._say(self.language.declaration(x.dtype, name, text, constant=True))
                 words[id(x)] = name
             each = [dict(words) for _ in lanes]
+            if block:
+                for lane, row in enumerate(each):
+                    row[id(block[0])] = self.language.in_block(block[1], term * len(lanes) + lane)
             for x in every(summed.body):
-                if isinstance(x, Element) and _only_last(x, counter):
+                if isinstance(x, Element) and _only_last(x, counter) and not (block and x is block[0]):
                     moved = self._element_after(x, last, term, first, shared) if count > 1 else None
                     for row, text in zip(each, self._neighbours(x, len(lanes), words, shared, moved), strict=True):
                         row[id(x)] = text
@@ -199,7 +248,7 @@ class Printer:
         self, x: Element, last: Counter, term: int, first: dict[int, str], shared: dict[int, int]
     ) -> str | None:
         """An element that many numbers of a counter on from the ``first``; None if they are not equally far apart."""
-        distance = _distance(x, last)
+        distance = stride_of(x, last)
         if distance is None:
             return None
         if term == 0:
@@ -376,18 +425,6 @@ def _common(x: Expression, counter: Counter) -> list[Expression]:
 def _only_last(x: Element, counter: Counter) -> bool:
     """Whether the next number of a counter is the next element."""
     return bool(x.at) and x.at[-1] is counter and not any(e is counter for i in x.at[:-1] for e in every(i))
-
-
-def _distance(x: Element, counter: Counter) -> int | None:
-    """How far apart the elements for two numbers of a counter lie, one after the other; None if that varies."""
-    stride, distance = 1, 0
-    for length, one in reversed(list(zip(x.tensor.shape, x.at, strict=True))):
-        if one is counter:
-            distance += stride
-        elif any(e is counter for e in every(one)):
-            return None
-        stride *= length
-    return distance
 
 
 def _plus(index: str, count: int) -> str:

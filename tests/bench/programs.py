@@ -1,10 +1,12 @@
-"""``python -m tests.bench.programs``: policies as C beside onnxruntime, and what they take of a microcontroller.
+"""``python -m tests.bench.programs``: policies as C beside onnxruntime, as C# beside C, and on a microcontroller.
 
 One decision of one agent, one thread, the smallest of 100 rounds: compiled by gcc -O2 and called in a loop; and
 onnxruntime's session with its inputs and outputs bound before, and called as people call it from Python. A ratio above
 1 says that the C is faster. Flash and RAM are of a Cortex-M4 with ``arm-none-eabi-gcc -O2`` (Debian's gcc-arm-none-eabi
 and libnewlib-arm-none-eabi), the policy, its weights, the mathematics of newlib and one agent's memory: no start-up
-code, no stack.
+code, no stack. C# is compiled by mcs and run by Mono, and by ``dotnet`` if that is on the PATH (PyPI's dotnetcore2 is
+the runtime of .NET Core 3.1); its ratio says how many times longer it takes than C. ``--full`` then runs every policy
+of ../shared under ASan and UBSan (an hour).
 """
 
 from __future__ import annotations
@@ -22,8 +24,10 @@ import numpy as np
 
 from converters.formats.programs.members import header_of
 from converters.runtimes.c import compiler
+from converters.runtimes.csharp import tools
 from exporter.export.pipeline import ExportOptions, export
 from fixtures import path
+from tests.programs import sanitize
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = (
@@ -64,6 +68,25 @@ int main(void)
     return 0;
 }}
 """
+_CS_TIMED = """
+static class Program
+{{
+    static void Main()
+    {{
+        var agent = new Policies.{kind}(1);
+        double least = 1e9;
+        for (int round = 0; round < 3 * {rounds}; round++) {{
+            long begun = System.Diagnostics.Stopwatch.GetTimestamp();
+            for (int i = 0; i < 100; i++) agent.Compute();
+            least = System.Math.Min(least, System.Diagnostics.Stopwatch.GetTimestamp() - begun);
+        }}
+        least *= 1e4 / System.Diagnostics.Stopwatch.Frequency;
+        System.Console.WriteLine(least.ToString(System.Globalization.CultureInfo.InvariantCulture));
+    }}
+}}
+"""
+_DOTNET = """{"runtimeOptions": {"framework": {"name": "Microsoft.NETCore.App", "version": "3.1.0"},
+"rollForward": "Major", "configProperties": {"System.Globalization.Invariant": true}}}"""
 _LINKED = """
 #define {upper}_IMPLEMENTATION
 #include "{name}.h"
@@ -84,21 +107,25 @@ def main() -> int:
     print(f"onnxruntime {onnxruntime.__version__}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}")
     print(
         f"{'':12}{'C, µs':>9}{'bound, µs':>11}{'ratio':>7}{'Python, µs':>12}{'ratio':>7}{'flash, kB':>11}{'RAM, B':>8}"
+        f"{'Mono, µs':>10}{'ratio':>7}{'.NET, µs':>10}{'ratio':>7}"
     )
     with tempfile.TemporaryDirectory() as scratch:
-        options = ExportOptions(Path(scratch), ("c", "onnx"), verify="none")
+        options = ExportOptions(Path(scratch), ("c", "csharp", "onnx"), verify="none")
         for result in (r for source in SOURCES for r in export([source], options)):
             header = header_of(result.policy.name, result.policy.signature)
             words = {"p": header.prefix, "upper": header.prefix.upper(), "name": result.policy.name, "rounds": ROUNDS}
             micros, memory = _timed(cc, result.folder, _TIMED.format(**words))
             bound, called = _onnxruntime(result.folder / f"{result.policy.name}.onnx", result.policy.name)
             flash = f"{_flash(arm, result.folder, _LINKED.format(**words)) / 1000:.1f}" if arm else "no gcc"
+            words["kind"] = header.class_name
+            virtual = _virtual_machines(result.folder, result.policy.name, _CS_TIMED.format(**words))
             print(
                 f"{result.policy.name:12}{micros:>9.2f}{bound:>11.1f}{bound / micros:>7.1f}{called:>12.1f}"
-                f"{called / micros:>7.1f}{flash:>11}{int(memory):>8}",
+                f"{called / micros:>7.1f}{flash:>11}{int(memory):>8}"
+                + "".join(f"{v:>10.2f}{v / micros:>7.2f}" if v else f"{'none':>10}{'':7}" for v in virtual),
                 flush=True,
             )
-    return 0
+    return sanitize.main() if "--full" in sys.argv[1:] else 0
 
 
 def _timed(cc: str, folder: Path, source: str) -> tuple[float, float]:
@@ -108,6 +135,20 @@ def _timed(cc: str, folder: Path, source: str) -> tuple[float, float]:
     done = subprocess.run([str(folder / "main")], check=True, capture_output=True, text=True)
     micros, memory = done.stdout.split()
     return float(micros), float(memory)
+
+
+def _virtual_machines(folder: Path, name: str, source: str) -> list[float | None]:
+    """Microseconds a decision in Mono and in .NET, of those that are here."""
+    here, dotnet = tools(), shutil.which("dotnet")
+    if here is None:
+        return [None, None]
+    mcs, mono = here
+    (folder / "main.cs").write_text(source)
+    (folder / "main.runtimeconfig.json").write_text(_DOTNET)
+    command = [mcs, "-langversion:7", "-optimize+", "-out:main.exe", "main.cs", f"{name}.cs"]
+    subprocess.run(command, check=True, cwd=folder, stdout=subprocess.DEVNULL)
+    runs = ([mono, "main.exe"], dotnet and [dotnet, "exec", "--runtimeconfig", "main.runtimeconfig.json", "main.exe"])
+    return [float(subprocess.run(r, check=True, cwd=folder, capture_output=True).stdout) if r else None for r in runs]
 
 
 def _flash(arm: str, folder: Path, source: str) -> int:

@@ -150,11 +150,11 @@ def row(found: Measured) -> str:
 
 
 def memory_of(found: Measured) -> list[str]:
-    """A sentence for each number of policies at which it was looked at."""
+    """A sentence for the least and the largest number of policies at which it was looked at."""
     return [
         f"{count} policies, `--jobs {found.jobs}`, verified in {found.verify}: {first:.0f} MiB, its workers "
         f"{' and '.join(f'{w:.0f}' for w in workers) or 'none'}"
-        for count, first, workers in found.memory
+        for count, first, workers in (*found.memory[:1], *found.memory[1:][-1:])
     ]
 
 

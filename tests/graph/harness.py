@@ -108,7 +108,8 @@ class Runtimes:
         self.need(runtime)
         inputs = tuple(replace(s, role=Role.PARAMETER) for s in policy.signature.inputs)
         signature = replace(policy.signature, inputs=inputs)
-        code, tool = code or CodeOptions(), {"name": "export-model", "version": "test"}
+        code = code or CodeOptions()
+        tool = {"name": "export-model", "version": "test", "code": code.to_dict()}
         contract = Contract(policy.name, signature, Origin("test", "0" * 64), policy.source, tool)
         how = WriteOptions(contract.compact(), code=code)
         artifact = WRITTEN[key].artifact(replace(policy, signature=signature), how)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -14,11 +15,12 @@ from converters.formats.programs.plan import CLOSE, ROWS, Plan, formula, plan_of
 from converters.formats.programs.weights import weights_name
 from converters.graph.ops.loops.layers import box_muller, gumbel
 from converters.graph.printer import Printer
+from converters.graph.program import Place
 from converters.policy.policy import Policy
 
 _UNIFORM = """
     /// <summary>The stream of draws, splitmix64: above 0, below 1. The same seed, the same draws as in C.</summary>
-    float Uniform()
+    float _Uniform()
     {
         unchecked
         {
@@ -32,10 +34,10 @@ _UNIFORM = """
 """.strip("\n")
 _NORMAL = """
     /// <summary>Draws from N(0, 1), by Box and Muller.</summary>
-    void Normal(float[] drawn)
+    void _Normal(float[] drawn)
     {
         for (int i = 0; i < drawn.Length; i++) {
-            float radius = Uniform(), turn = Uniform();
+            float radius = _Uniform(), turn = _Uniform();
             drawn[i] = $X;
         }
     }
@@ -58,7 +60,7 @@ public static void Load(global::System.IO.Stream stream)
         for (int bit = 0; bit < 8; bit++) crc = (crc >> 1) ^ ((crc & 1) != 0 ? 0xEDB88320u : 0u);
     }
     if (~crc != $SUM) throw new global::System.IO.InvalidDataException("the weights have another checksum");
-$LINES    loaded = true;
+$LINES    _loaded = true;
 }
 """
 
@@ -96,7 +98,7 @@ def _text(file: str, plan: Plan) -> str:
         *_beginning(name, plan, draws=draws),
         "    /// <summary>Decides: draws the noise where there is some, then computes.</summary>\n"
         "    public void Act()\n    {\n"
-        + "".join(f"        Normal({f.name});\n" for f in header.noise)
+        + "".join(f"        _Normal(this.{f.name});\n" for f in header.noise)
         + "        Compute();\n    }",
         "    /// <summary>Computes with the noise that stands in its members (zeros: without chance).</summary>\n"
         '    /// <exception cref="System.IndexOutOfRangeException">An observed index lies outside.</exception>\n'
@@ -107,7 +109,7 @@ def _text(file: str, plan: Plan) -> str:
         *([_UNIFORM] if draws else []),
         *([_NORMAL.replace("$X", printer.function(box_muller, "radius", "turn"))] if header.noise else []),
     ]
-    constants = _weights(file, plan, words, printer)
+    constants = _weights(file, plan, words, printer, body)
     inner = [*(m.rstrip("\n") for m in members), *methods]
     if words.helpers:
         inner += ["\n".join(f"    {line}" for line in h.splitlines()) for h in words.helpers.values()]
@@ -126,14 +128,13 @@ def _compute_lines(plan: Plan, printer: Printer) -> list[str]:
     statements = printer.body(program, depth=2)
     fields = [*printer.inputs(program), *(s.result.place for s in program.stages)]
     lines = [f"        {CS_TYPES[p.dtype.name]}[] {(n := printer.name(p))} = this.{n};" for p in fields]
-    lines += [  # a virtual machine looks up each static
-        f"        {CS_TYPES[p.dtype.name]}[] {(n := printer.name(p))} = {header.class_name}.{n};"
-        for p in program.constants
-    ]
+    statics = [(printer.name(p), CS_TYPES[p.dtype.name]) for p in _read_whole(plan, printer, statements)]
+    statics += [(name, "_Block") for name in printer.packed]
+    lines += [f"        {kind}[] {n} = {header.class_name}.{n};" for n, kind in statics]  # looked up once
     lines += statements
     if plan.weights.file is not None:
         wrong = 'throw new global::System.InvalidOperationException("load the weights first");'
-        lines.insert(0, f"        if (!loaded) {wrong}")
+        lines.insert(0, f"        if (!_loaded) {wrong}")
     for f in header.answered:
         target = header.state if f is header.next_state and header.state else f
         source = printer.name(program.outputs[f.spec.name].place)
@@ -141,11 +142,18 @@ def _compute_lines(plan: Plan, printer: Printer) -> list[str]:
     return lines
 
 
+def _read_whole(plan: Plan, printer: Printer, lines: Sequence[str]) -> list[Place]:
+    """The constants that statements or outputs read as arrays, not in blocks alone."""
+    words = {*re.findall(r"\w+", "\n".join(lines))}
+    given = {id(t.place) for t in plan.program.outputs.values()}
+    return [p for p in plan.program.constants if id(p) in given or printer.name(p) in words]
+
+
 def _beginning(name: str, plan: Plan, *, draws: bool) -> list[str]:
     """The constructor and ``Reset``."""
     header = plan.header
     quiet = "".join(
-        f"        global::System.Array.Clear({f.name}, 0, {f.size});\n"
+        f"        global::System.Array.Clear(this.{f.name}, 0, {f.size});\n"
         for f in (*header.noise, *((header.state,) if header.state else ()))
     )
     stream = "        stream = seed;\n" if draws else ""
@@ -169,17 +177,27 @@ def _sizes(plan: Plan) -> str:
     )
 
 
-def _weights(file: str, plan: Plan, words: CSharp, printer: Printer) -> list[str]:
+def _weights(file: str, plan: Plan, words: CSharp, printer: Printer, body: Sequence[str]) -> list[str]:
     """The constants, and the method that loads those that are in the file."""
-    named = [(printer.name(kept.place), CS_TYPES[kept.place.dtype.name], kept) for kept in plan.weights.kept]
-    parts = [f"static readonly {kind}[] {n} = {words.constant(kept)};" for n, kind, kept in named if not kept.offsets]
+    whole = {id(p) for p in _read_whole(plan, printer, body)}
+    here, members, lines = list[str](), list[str](), list[str]()
+    for kept in plan.weights.kept:
+        name, kind, text = printer.name(kept.place), CS_TYPES[kept.place.dtype.name], words.constant(kept)
+        blocks = [(called, p) for called, p in printer.packed.items() if p.place is kept.place]
+        stays = id(kept.place) in whole or len(blocks) > 1
+        if kept.offsets:
+            members += [f"static {kind}[] {name};"] * stays + [f"static _Block[] {called};" for called, _ in blocks]
+            lines.append(f"    {'' if stays else f'{kind}[] '}{name} = {text};\n")
+            lines += [f"    {called} = {words.blocks_of(p, name)};\n" for called, p in blocks]
+        else:
+            here += [f"static readonly {kind}[] {name} = {text};"] * stays
+            array = name if stays else text
+            here += [f"static readonly _Block[] {called} = {words.blocks_of(p, array)};" for called, p in blocks]
     if plan.weights.file is None:
-        return parts
-    inside = [(n, kind, kept) for n, kind, kept in named if kept.offsets]
-    lines = "".join(f"    {n} = {words.constant(kept)};\n" for n, _, kept in inside)
+        return here
     load = _LOAD.replace("$FILE", weights_name(file)).replace("$SIZE", str(len(plan.weights.file)))
-    load = load.replace("$SUM", f"0x{plan.weights.checksum:08X}u").replace("$LINES", lines).strip("\n")
-    return [*parts, "\n".join(["static bool loaded;", *(f"static {kind}[] {n};" for n, kind, _ in inside)]), load]
+    load = load.replace("$SUM", f"0x{plan.weights.checksum:08X}u").replace("$LINES", "".join(lines)).strip("\n")
+    return [*here, "\n".join(["static bool _loaded;", *members]), load]
 
 
 def _unusual(plan: Plan, words: CSharp) -> str:
@@ -189,10 +207,10 @@ def _unusual(plan: Plan, words: CSharp) -> str:
         name = guarded.field.name
         for called, values in (("mean", guarded.mean), ("limit", guarded.limit)):
             literals = ", ".join(words.literal(x, kind) for x in values)
-            arrays.append(f"    static readonly float[] {called}_{name} = {{ {literals} }};\n")
-        off = f"global::System.Math.Abs({name}[i] - mean_{name}[i])"
+            arrays.append(f"    static readonly float[] _{called}_{name} = {{ {literals} }};\n")
+        off = f"global::System.Math.Abs(this.{name}[i] - _mean_{name}[i])"
         loops.append(f"        for (int i = 0; i < {guarded.field.size}; i++)\n")
-        loops.append(f"            if (!({off} <= limit_{name}[i])) count++;\n")
+        loops.append(f"            if (!({off} <= _limit_{name}[i])) count++;\n")
     return (
         f"{''.join(arrays)}\n    /// <summary>How many observed numbers lie farther than {plan.code.guard:g} standard "
         "deviations from their mean in training; NaN does.</summary>\n"
@@ -212,15 +230,15 @@ def _member(field: Field) -> str:
 def _choose(field: Field, sizes: Sequence[int], printer: Printer) -> str:
     """The method that draws classes by their log-probabilities, by the Gumbel trick."""
     return (
-        f"    static readonly int[] branches = {{ {', '.join(map(str, sizes))} }};\n\n"
+        f"    static readonly int[] _branches = {{ {', '.join(map(str, sizes))} }};\n\n"
         "    /// <summary>Draws a class for each branch.</summary>\n    public void Choose(int[] classes)\n    {\n"
-        "        int start = 0;\n        for (int branch = 0; branch < branches.Length; branch++) {\n"
+        "        int start = 0;\n        for (int branch = 0; branch < _branches.Length; branch++) {\n"
         "            float best = float.NegativeInfinity;\n            classes[branch] = 0;\n"
-        "            for (int i = 0; i < branches[branch]; i++) {\n"
-        "                float u = Uniform();\n"
-        f"                float drawn = {printer.function(gumbel, f'{field.name}[start + i]', 'u')};\n"
+        "            for (int i = 0; i < _branches[branch]; i++) {\n"
+        "                float u = _Uniform();\n"
+        f"                float drawn = {printer.function(gumbel, f'this.{field.name}[start + i]', 'u')};\n"
         "                if (best < drawn) { best = drawn; classes[branch] = i; }\n            }\n"
-        "            start += branches[branch];\n        }\n    }"
+        "            start += _branches[branch];\n        }\n    }"
     )
 
 
@@ -234,17 +252,17 @@ def _selftest(plan: Plan, words: CSharp) -> str:
         return f"{head}        return 0;\n    }}"
     numbers = ", ".join(words.literal(x, np.dtype(np.float32)) for x in plan.golden)
     fed = "".join(
-        f"            for (int i = 0; i < {f.size}; i++) {f.name}[i] = "
+        f"            for (int i = 0; i < {f.size}; i++) this.{f.name}[i] = "
         f"{_one(f, formula(f, '((i * 7 + row * 5) % 17 - 8) / 8f'))};\n"
         for f in plan.header.inputs
     )
-    checks = "".join(f"            wrong += Wrong({f.name}, golden, ref at);\n" for f in plan.checked)
+    checks = "".join(f"            wrong += _Wrong(this.{f.name}, golden, ref at);\n" for f in plan.checked)
     return (
         f"{head}        float[] golden = {{ {numbers} }}; // NaN: not compared\n        int wrong = 0, at = 0;\n"
         f"        for (int row = 0; row < {ROWS}; row++) {{\n            Reset(0);\n{fed}"
         f"            Compute();\n{checks}"
         "        }\n        return wrong;\n    }\n\n"
-        "    static int Wrong(float[] answer, float[] golden, ref int at)\n    {\n        int wrong = 0;\n"
+        "    static int _Wrong(float[] answer, float[] golden, ref int at)\n    {\n        int wrong = 0;\n"
         "        foreach (float x in answer) {\n            float y = golden[at++];\n"
         f"            float most = {CLOSE}f * (1 + global::System.Math.Abs(y));\n"
         "            if (!float.IsNaN(y) && !(global::System.Math.Abs(x - y) <= most)) wrong++;\n"

@@ -26,33 +26,33 @@ _SAME = ("exp", "expm1", "log", "log1p", "sqrt", "sin", "cos", "tan", "tanh", "f
 _PLAIN = {"max": "Math.max", "min": "Math.min", "abs": "Math.abs"}
 #: Functions of a number's bits.
 _RAW = {
-    "bits": "function bits(a) {\n    word[0] = a;\n    return wordBits[0];\n}",
-    "of_bits": "function of_bits(a) {\n    wordBits[0] = a;\n    return word[0];\n}",
+    "bits": "function _bits(a) {\n    _word[0] = a;\n    return _wordBits[0];\n}",
+    "of_bits": "function _of_bits(a) {\n    _wordBits[0] = a;\n    return _word[0];\n}",
 }
-_WORD = "const word = new Float32Array(1), wordBits = new Int32Array(word.buffer);"
+_WORD = "const _word = new Float32Array(1), _wordBits = new Int32Array(_word.buffer);"
 #: Functions that a module brings along.
 _HELPERS = {
-    "mod": "function mod(a, b) { const r = a % b; return r !== 0 && r < 0 !== b < 0 ? r + b : r; }",
-    "intdiv": "function intdiv(a, b) { return Math.floor(a / b); }",
-    "rint": "function rint(a) { return Math.abs(a % 1) === 0.5 ? 2 * Math.round(a / 2) : Math.round(a); }",
+    "mod": "function _mod(a, b) { const r = a % b; return r !== 0 && r < 0 !== b < 0 ? r + b : r; }",
+    "intdiv": "function _intdiv(a, b) { return Math.floor(a / b); }",
+    "rint": "function _rint(a) { return Math.abs(a % 1) === 0.5 ? 2 * Math.round(a / 2) : Math.round(a); }",
     "within": (
-        "function within(a, count) {\n    if (a >= 0 && a < count) return a;\n"
+        "function _within(a, count) {\n    if (a >= 0 && a < count) return a;\n"
         "    throw new RangeError(`the index ${a} lies outside of a table of ${count}`);\n}"
     ),
     "half": (
-        "function half(a) { // the number in 16 bits\n    const exponent = a >> 10 & 31;\n"
+        "function _half(a) { // the number in 16 bits\n    const exponent = a >> 10 & 31;\n"
         "    const size = ((a & 1023) + (exponent ? 1024 : 0)) * 2 ** ((exponent || 1) - 25);\n"
         "    return a & 0x8000 ? -size : size;\n}"
     ),
     "widen": (
-        "function widen(steps, length, inner) { // a length for each channel\n"
+        "function _widen(steps, length, inner) { // a length for each channel\n"
         "    return Float32Array.from(steps, (n, i) => n * length[Math.floor(i / inner) % length.length]);\n}"
     ),
     "whole": (
-        "function whole(a, limit) {\n    return a >= -limit && a < limit ? Math.trunc(a) : -limit;\n}"
+        "function _whole(a, limit) {\n    return a >= -limit && a < limit ? Math.trunc(a) : -limit;\n}"
     ),
     "erf": (
-        "function erf(a) { // by its power series\n    if (!(Math.abs(a) < 4)) return a > 0 ? 1 : a < 0 ? -1 : a;\n"
+        "function _erf(a) { // by its power series\n    if (!(Math.abs(a) < 4)) return a > 0 ? 1 : a < 0 ? -1 : a;\n"
         "    let term = a, sum = a;\n    for (let n = 1; n < 70; n++) {\n        term *= -a * a / n;\n"
         "        sum += term / (2 * n + 1);\n    }\n    return sum * 1.1283791670955126;\n}"
     ),
@@ -64,7 +64,7 @@ class JavaScript(Language):
 
     functions = (
         {name: f"Math.{name}({{0}})" for name in _SAME}
-        | {name: f"{name}({{0}})" for name in ("erf", "rint")}
+        | {name: f"_{name}({{0}})" for name in ("erf", "rint")}
         | {"pow": "Math.pow({0}, {1})"}
     )
 
@@ -99,7 +99,7 @@ class JavaScript(Language):
             return f"fround({bare(text)})"
         if source == FLOAT32:
             self.helpers["whole"] = _HELPERS["whole"]
-            return f"whole({bare(text)}, {2**31 if target == INT32 else 2**63})"
+            return f"_whole({bare(text)}, {2**31 if target == INT32 else 2**63})"
         return f"({text} | 0)" if target == INT32 else text
 
     def helper(self, function: str, operands: Sequence[str], dtype: np.dtype) -> str:
@@ -108,7 +108,7 @@ class JavaScript(Language):
             self.helpers |= {"word": _WORD, function: _RAW[function]}
         elif function not in _PLAIN:
             self.helpers[function] = _HELPERS[function]
-        text = f"{_PLAIN.get(function, function)}({', '.join(bare(o) for o in operands)})"
+        text = f"{_PLAIN.get(function, f'_{function}')}({', '.join(bare(o) for o in operands)})"
         return f"fround({text})" if function in ("mod", "intdiv") and dtype == FLOAT32 else text
 
     def own_name(self, function: str) -> str:
@@ -121,7 +121,7 @@ class JavaScript(Language):
 
     def draw(self) -> str:
         """The next number of an agent's stream."""
-        return "this.uniform()"
+        return "this._uniform()"
 
     def round_to(self, text: str, x: Applied) -> str:
         """A float32, by ``Math.fround``."""
@@ -153,10 +153,10 @@ class JavaScript(Language):
             arrays = [f"new {JS_ARRAYS[p.dtype.name]}([\n    {lines_of(self._words(p))},\n])" for p in parts]
         if kept.step is not None:
             self.helpers["widen"] = _HELPERS["widen"]
-            return f"widen({', '.join(arrays)}, {kept.inner})"
+            return f"_widen({', '.join(arrays)}, {kept.inner})"
         if kept.narrow is not kept.place:
             self.helpers["half"] = _HELPERS["half"]
-            return f"Float32Array.from({arrays[0]}, half)"
+            return f"Float32Array.from({arrays[0]}, _half)"
         return arrays[0]
 
     def _words(self, place: Place) -> list[str]:

@@ -20,7 +20,7 @@ from converters.policy.policy import Policy
 
 _UNIFORM = """
     /** The stream of draws, splitmix64: above 0, below 1. The same seed gives the same draws as in C and C#. */
-    uniform() {
+    _uniform() {
         this.stream = BigInt.asUintN(64, this.stream + 0x9E3779B97F4A7C15n);
         let z = this.stream;
         z = BigInt.asUintN(64, (z ^ (z >> 30n)) * 0xBF58476D1CE4E5B9n);
@@ -31,9 +31,9 @@ _UNIFORM = """
 """.strip("\n")
 _NORMAL = """
     /** Draws from N(0, 1), by Box and Muller. */
-    normal(out) {
+    _normal(out) {
         for (let i = 0; i < out.length; i++) {
-            const radius = this.uniform(), turn = this.uniform();
+            const radius = this._uniform(), turn = this._uniform();
             out[i] = $X;
         }
     }
@@ -51,7 +51,7 @@ export function load(content) {
     }
     if (bytes.length !== $SIZE) throw new RangeError(`the weights are ${bytes.length} bytes, not $SIZE`);
     if (~crc >>> 0 !== $SUM) throw new RangeError("the weights have another checksum");
-$LINES    loaded = true;
+$LINES    _loaded = true;
 }
 """
 
@@ -76,7 +76,7 @@ def _text(name: str, plan: Plan) -> str:
     places = [stage.result.place for stage in program.stages]
     draws = printer.draws or bool(header.noise) or plan.chosen is not None
     quiet = [*header.noise, *([header.state] if header.state else [])]
-    drawn = "".join(f"        this.normal(this.{f.name});\n" for f in header.noise)
+    drawn = "".join(f"        this._normal(this.{f.name});\n" for f in header.noise)
     methods = [
         "    /** A new agent, whose draws begin with a seed. */\n    constructor(seed = 0) {\n"
         + "".join(_member(f) for f in (*header.fed, *header.outputs))
@@ -122,7 +122,7 @@ def _compute_lines(plan: Plan, printer: Printer) -> list[str]:
     aliases = sorted({*(printer.name(p) for p in printer.inputs(program)), *results})
     lines = [f"        const {{ {', '.join(aliases)} }} = this;"] if aliases else []
     if plan.weights.file is not None:
-        lines.insert(0, '        if (!loaded) throw new Error("load the weights first");')
+        lines.insert(0, '        if (!_loaded) throw new Error("load the weights first");')
     lines += statements
     for f in header.answered:
         target = header.state if f is header.next_state and header.state else f
@@ -152,7 +152,7 @@ def _weights(name: str, plan: Plan, words: JavaScript, printer: Printer) -> list
     lines = "".join(f"    {n} = {words.constant(kept)};\n" for n, kept in inside)
     load = _LOAD.replace("$FILE", weights_name(name)).replace("$SIZE", str(len(plan.weights.file)))
     load = load.replace("$SUM", f"0x{plan.weights.checksum:08X}").replace("$LINES", lines).strip("\n")
-    return [*parts, "\n".join(["let loaded = false;", *(f"let {n};" for n, _ in inside)]), load]
+    return [*parts, "\n".join(["let _loaded = false;", *(f"let {n};" for n, _ in inside)]), load]
 
 
 def _unusual(plan: Plan, words: JavaScript) -> str:
@@ -186,7 +186,7 @@ def _choose(field: Field, sizes: Sequence[int], printer: Printer) -> str:
         f"        let start = 0;\n        [{', '.join(map(str, sizes))}].forEach((size, branch) => {{\n"
         "            let best = -Infinity;\n            action[branch] = 0;\n"
         "            for (let i = 0; i < size; i++) {\n"
-        f"                const u = this.uniform();\n"
+        f"                const u = this._uniform();\n"
         f"                const drawn = {printer.function(gumbel, f'this.{field.name}[start + i]', 'u')};\n"
         "                if (best < drawn) { best = drawn; action[branch] = i; }\n            }\n"
         "            start += size;\n        });\n        return action;\n    }"

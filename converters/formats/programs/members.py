@@ -15,7 +15,8 @@ from signatures.spec import PolicySignature, TensorSpec
 
 #: What the actor does not need.
 _REST = frozenset((Role.VALUE, Role.ACTION_PROBS, Role.LOG_PROB, Role.STD, Role.LOG_STD))
-#: Words that no member can have in C, C++, C# or JavaScript, and those that programs use themselves.
+#: Words that no member or class can have: of C, C++, C# and JavaScript, what programs offer, and what they take of
+#: JavaScript. What else they name begins with ``_``, ``t_`` or ``w_``, or is local to what does not name members.
 _KEYWORDS = tuple(
     """auto break case char const continue default do double else enum extern float for goto if inline int long
     register restrict return short signed sizeof static struct switch typedef union unsigned void volatile while class
@@ -24,7 +25,10 @@ _KEYWORDS = tuple(
     abstract as base byte checked decimal delegate event finally fixed foreach implicit in interface internal is lock
     null object out override params readonly ref sbyte sealed stackalloc string typeof uint ulong unchecked unsafe
     ushort await debugger extends function import instanceof let package super var with yield arguments eval undefined
-    fround constructor floats ints longs stream""".split()  # noqa: SIM905  a list of eighty lines otherwise
+    fround constructor floats ints longs math_errhandling stream unix linux
+    Act Branches Choose Compute Load Reset SelfTest Sizes Unusual act choose compute load ports reset selftest unusual
+    ArrayBuffer BigInt Error Float32Array Float64Array Infinity Int16Array Int32Array Int8Array Math NaN Number
+    RangeError Uint16Array Uint8Array""".split()  # noqa: SIM905  a list of eighty lines otherwise
 )
 
 
@@ -49,7 +53,7 @@ class Header(Struct, frozen=True):
     @property
     def class_name(self) -> str:
         """The name of a class."""
-        return self.prefix[0].upper() + self.prefix[1:]
+        return _class_name(self.prefix)
 
     @property
     def fed(self) -> tuple[Field, ...]:
@@ -75,8 +79,9 @@ def header_of(name: str, signature: PolicySignature, code: CodeOptions | None = 
     prefix = word if not word[0].isdigit() else f"policy_{word}"
     memory_in, memory_out = signature.recurrence or ("", "")
     wanted = answers(signature, code)
-    fields = _fields(s for s in signature.inputs)
-    outputs = [f for f in _fields(s for s in signature.outputs) if f.spec.name in wanted]
+    scope = NameScope((*_KEYWORDS, _class_name(prefix)))
+    fields = _fields(signature.inputs, scope)
+    outputs = [f for f in _fields(signature.outputs, scope) if f.spec.name in wanted]
     return Header(
         prefix,
         tuple(f for f in fields if f.spec.role is not Role.NOISE and f.spec.name != memory_in),
@@ -87,11 +92,20 @@ def header_of(name: str, signature: PolicySignature, code: CodeOptions | None = 
     )
 
 
-def _fields(specs: Iterable[TensorSpec]) -> list[Field]:
-    scope = NameScope(_KEYWORDS)
+def _class_name(prefix: str) -> str:
+    name = prefix[0].upper() + prefix[1:]
+    return f"Policy_{name}" if name in _KEYWORDS else name
+
+
+def _member_name(name: str) -> str:
+    """As a tensor is called, but for what C's own headers, whose macros are in capitals, may make of it."""
+    word = identifier(name)
+    return f"x{word}" if word[0].isdigit() or word.isupper() else word
+
+
+def _fields(specs: Iterable[TensorSpec], scope: NameScope) -> list[Field]:
     found = []
     for spec in specs:
-        word = identifier(spec.name)
         size = 1
         for length in spec.shape[1:] if spec.batched else spec.shape:
             size *= 1 if length is None else length
@@ -101,5 +115,5 @@ def _fields(specs: Iterable[TensorSpec]) -> list[Field]:
                 why="a member of a structure holds at least one number",
                 fix="leave that input out of the source, or export to onnx, saved_model, tfjs or bytes",
             )
-        found.append(Field(scope.fresh(f"x{word}" if word[0].isdigit() else word), spec, size))
+        found.append(Field(scope.fresh(_member_name(spec.name)), spec, size))
     return found

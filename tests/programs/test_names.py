@@ -1,0 +1,135 @@
+"""A policy may call its inputs as programs call anything of theirs: it still compiles, and computes the same."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from converters.formats.format import Format, WriteOptions
+from converters.formats.programs.members import header_of
+from converters.graph.nodes import Graph, Node, TensorShape
+from converters.graph.run import run_graph
+from converters.graph.types import FLOAT32
+from converters.policy.policy import Policy
+from converters.runtimes.pool import RuntimePool
+from exporter.export.sources import read_source
+from fixtures import FIXTURES, path
+from signatures.code import CodeOptions
+from tests.graph.harness import Runtimes, policy_of
+from tests.programs.mains import MAINS
+from tests.programs.test_options import build, said
+from tests.programs.test_programs import PROGRAMS
+
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("programs")]
+
+each_program = pytest.mark.parametrize("form", PROGRAMS, ids=lambda form: form.key)
+CODES = (CodeOptions(), CodeOptions(math="own"), CodeOptions(weights="file", outputs="all"))
+#: Ops that bring functions along, on numbers that all inputs add up to.
+_UNARY = ("Erf", "Expm1", "Log1p", "Exp", "Tanh", "Sin", "Abs", "Round", "Floor", "Elu", "Softmax")
+_BINARY = ("Maximum", "Minimum", "FloorMod", "Pow")
+
+
+def policy_with(names: list[str]) -> Policy:
+    """A policy with an input of each name: functions of their mean, weights, draws."""
+    inputs = [Node(n, "Placeholder", attrs={"dtype": FLOAT32, "shape": TensorShape((None, 16))}) for n in names]
+    nodes, level = list(inputs), [n.name for n in inputs]
+    while len(level) > 1:
+        pairs = [level[i : i + 2] for i in range(0, len(level), 2)]
+        made = [Node(f"_{len(nodes) + i}", "Add", tuple(p)) for i, p in enumerate(pairs) if len(p) == 2]
+        nodes += made
+        level = [n.name for n in made] + [p[0] for p in pairs if len(p) == 1]
+    weights = np.linspace(-1, 1, 16 * 16, dtype=np.float32).reshape(16, 16)
+    nodes += [
+        Node("_of", "Const", value=np.array(1 / len(names), np.float32)),
+        Node("_mean", "Mul", (level[0], "_of")),
+        Node("_weights", "Const", value=weights),
+        Node("_product", "MatMul", ("_mean", "_weights"), {"transpose_a": False, "transpose_b": False}),
+        Node("_half", "Const", value=np.array(0.5, np.float32)),
+        *(Node(f"_{op}", op, ("_product",)) for op in _UNARY if op != "Log1p"),
+        Node("_Log1p", "Log1p", ("_Abs",)),
+        *(Node(f"_{op}", op, ("_Abs", "_half")) for op in _BINARY),
+    ]
+    return policy_of(Graph(tuple(nodes)), [f"_{op}" for op in (*_UNARY, *_BINARY)])
+
+
+def texts(policy: Policy, form: Format) -> list[str]:
+    made = []
+    for code in CODES:
+        (first, *_) = form.artifact(policy, WriteOptions("{}", code=code)).files.values()
+        made.append(first.to_bytes().decode())
+    return made
+
+
+@cache
+def words() -> tuple[str, ...]:
+    """Every word that a program of any language is made of."""
+    policies = [p for name in FIXTURES for p in read_source(path(name)).policies()]
+    found = set[str]()
+    for form in PROGRAMS:
+        for policy in (*policies, policy_with(["one", "two"])):
+            for text in texts(policy, form):
+                code = re.sub(r"/\*.*?\*/|//[^\n]*", "", text, flags=re.DOTALL)
+                found |= set(re.findall(r"(?<![\w.])[A-Za-z]\w*", code))
+    return tuple(sorted(w for w in found if not re.fullmatch(r"y\d+", w)))  # outputs of policy_with
+
+
+def test_words_are_those_of_programs() -> None:
+    assert {"for", "Math", "NAN", "Compute", "act", "at", "sum0", "System", "memset", "prototype"} - set(words()) == {
+        "prototype"
+    }
+
+
+@pytest.mark.parametrize("code", CODES, ids=("plain", "own mathematics", "weights in a file"))
+@each_program
+def test_inputs_called_as_a_program_calls_something(
+    form: Format, code: CodeOptions, tmp_path: Path, processes: RuntimePool
+) -> None:
+    runtimes = Runtimes(processes, tmp_path)
+    runtimes.need(form.runtimes[0])
+    names = list(words())
+    policy = policy_with(names)
+    random = np.random.default_rng(7)
+    feeds = {n: random.normal(size=(1, 16)).astype(np.float32) for n in names}
+    fetches = [policy.fetches[s.name] for s in policy.signature.outputs]
+    expected = run_graph(policy.graph, feeds, fetches)
+    found = runtimes.program(form.key, policy, feeds, code)
+    for fetch, one in zip(fetches, found, strict=True):
+        np.testing.assert_allclose(one, expected[fetch], rtol=2e-5, atol=2e-5, err_msg=fetch)
+
+
+@pytest.mark.parametrize("name", ["act", "reset", "math", "float32Array", "exp", "block", "sizes", "bigInt", "int"])
+@each_program
+def test_policies_called_as_a_program_calls_something(form: Format, name: str, tmp_path: Path) -> None:
+    """Draws, the state and the guard included."""
+    (policy,) = read_source(path("recurrent")).policies()
+    plain = header_of(policy.name, policy.signature)
+    expected = tmp_path / "expected"
+    for folder, called in ((expected, policy.name), (tmp_path / "found", name)):
+        folder.mkdir()
+        named = replace(policy, name=called)
+        for each, pieces in form.artifact(named, WriteOptions("{}")).files.items():
+            (folder / each).write_bytes(pieces.to_bytes())
+    main = MAINS[form.key][0]
+    wanted = said(build(form, main(policy.name, plain), expected), expected)
+    here = tmp_path / "found"
+    assert said(build(form, main(name, header_of(name, policy.signature)), here), here) == wanted
+
+
+def test_no_macro_of_the_headers_is_a_member() -> None:
+    """What gcc defines in the headers that a program includes, or anywhere; those that take arguments do no harm."""
+    gcc = shutil.which("gcc") or pytest.skip("gcc is not installed")
+    headers = ("stddef", "stdint", "float", "math", "string")
+    text = "".join(f"#include <{h}.h>\n" for h in headers)
+    made = subprocess.run([str(gcc), "-dM", "-E", "-"], input=text, capture_output=True, text=True, check=True).stdout
+    macros = re.findall(r"^#define ([A-Za-z]\w*)(?![\w(])", made, re.MULTILINE)
+    assert {"NAN", "FLT_MAX", "NULL", "linux"} <= set(macros)
+    names = sorted({m for m in macros if not m.endswith("_")})
+    header = header_of("p", policy_with(names).signature)
+    assert not {f.name for f in header.inputs} & set(macros)
