@@ -146,7 +146,9 @@ int main(void)
         FILE *const file = fopen(files[i], "rb");
         const size_t size = fread(bytes, 1, sizeof words, file);
         fclose(file);
-        printf("%d\\n", continuous_load(&memory, bytes, size) == 0 ? 1 : 0);
+        const int loaded = continuous_load(&memory, bytes, size) == 0;
+        continuous_reset(&memory, 1); /* which keeps the weights */
+        printf("%d\\n", loaded && continuous_act(&input, &memory, &output) == 0 ? 1 : 0);
     }
     printf("%d\\n", continuous_load(&memory, bytes + 1, continuous_weights_size) == 0 ? 1 : 0);
     return 0;

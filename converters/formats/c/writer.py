@@ -136,7 +136,8 @@ def _declarations(name: str, plan: Plan, choose: str) -> list[str]:
         ),
         _struct(f"{p}_output", "What an agent does.", map(_member, header.outputs)),
         *([LOAD_SAID.replace("$P", p).replace("$FILE", weights_name(name)).strip()] if loads else []),
-        f"/* Begin an episode: no state, draws by a seed. */\nvoid {p}_reset({p}_memory *memory, uint64_t seed);\n"
+        f"/* Begin an episode: no state, draws by a seed{'; the weights stay loaded' * loads}. */\n"
+        f"void {p}_reset({p}_memory *memory, uint64_t seed);\n"
         f"/* Decide: draw the noise where there is some, then compute. 0; 1, and no output, where an observed index\n"
         f"   lies outside of the table that it is looked up in{'; 2 before the weights are loaded' * loads}. */\n"
         f"int {p}_act(const {p}_input *input, {p}_memory *memory, {p}_output *output);\n"
