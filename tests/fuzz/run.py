@@ -106,8 +106,11 @@ def run(readers: Sequence[str], first: int, count: int) -> Result:
                 result.add(at, {"kind": "hang" if line is None else "death", "said": said, "place": ""})
                 at += 1
                 break
-            result.add(at, json.loads(line))
+            result.add(at, outcome := json.loads(line))
             at += 1
-        else:
-            worker.end()
+            if (
+                outcome["kind"] == "memory"
+            ):  # what a process once took, it would be found to take with each that follows
+                break
+        worker.end()
     return result

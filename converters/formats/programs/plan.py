@@ -20,7 +20,7 @@ from converters.interfaces.text import ALL, loop_lines, term_lines
 from converters.policy.policy import Policy
 from signatures.code import CodeOptions
 from signatures.contract import EMBEDDED
-from signatures.errors import GraphError, UsageError
+from signatures.errors import GraphError, UnsupportedOpError, UsageError
 from signatures.roles import Role
 from signatures.spec import PolicySignature
 
@@ -62,6 +62,14 @@ def plan_of(policy: Policy, options: WriteOptions) -> Plan:
     header = header_of(policy.name, policy.signature, code)
     fetches = {f.spec.name: policy.fetches[f.spec.name] for f in header.answered}
     program = program_of(prepare(policy, PROGRAM), policy.feeds, fetches)
+    for f in header.answered:
+        if program.outputs[f.spec.name].place.size != f.size:
+            raise UnsupportedOpError(
+                f"{f.spec.name!r} ({f.spec.role}) cannot be written as source code: one agent gets "
+                f"{program.outputs[f.spec.name].place.size} numbers of it",
+                why=f"its shape {list(f.spec.shape)} says {f.size}",
+                fix="mend the shapes that the source declares, or export to onnx, saved_model, tfjs or bytes",
+            )
     contract = _in_comment(options.contract)
     sizes = tuple(policy.signature.branches)
     chosen = next((f for f in header.outputs if f.spec.role is Role.LOG_PROBS), None)
