@@ -247,6 +247,7 @@ def page(content: Mapping[str, Any]) -> str:
         *_table(["runtime", "version"], [[r, v] for r, v in content["runtimes"].items()]),
         *(_profiles(content["unity"]) if "unity" in content else []),
         *(_litert(content["litert"]) if "litert" in content else []),
+        *(_litert_web(content["litert-web"]) if "litert-web" in content else []),
         *(_programs(content["programs"]) if "programs" in content else []),
     ]
     return "\n".join(lines).rstrip() + "\n"
@@ -305,6 +306,17 @@ def _litert(counted: Mapping[str, Any]) -> list[str]:
     ]
 
 
+def _litert_web(counted: Mapping[str, Any]) -> list[str]:
+    """What LiteRT.js answers, below the section on ``--to litert``."""
+    refused = "; ".join(f"{what}: {n}" for what, n in counted["refused"].items()) or "none"
+    return [
+        f"LiteRT.js in Chromium (`python -m tests.figures --litert-web`, {counted['date']}): {counted['agree']} of "
+        f"{counted['onnx']} agree, {counted['one']} files for one agent, the others, in which classes are drawn, for "
+        f"64. Refused: {refused}. Not in agreement: {', '.join(counted['failed']) or 'none'}.",
+        "",
+    ]
+
+
 def _programs(counted: Mapping[str, Any]) -> list[str]:
     """The section on source code."""
     rows = counted["keys"]
@@ -348,6 +360,7 @@ def main() -> int:
     parser.add_argument("--page", action="store_true", help="only the page, from the figures that are there")
     parser.add_argument("--profiles", action="store_true", help="only what each profile of --for holds")
     parser.add_argument("--litert", action="store_true", help="only what is written as .tflite")
+    parser.add_argument("--litert-web", action="store_true", help="only what LiteRT.js answers in Chromium")
     parser.add_argument("--programs", action="store_true", help="only what is written as source code")
     options = parser.parse_args()
     before = json.loads(FIGURES.read_text(encoding="utf-8")) if FIGURES.is_file() else {}
@@ -364,6 +377,13 @@ def main() -> int:
         with RuntimePool() as pool:
             found = {"date": _today(), **litert.sweep(known.sources(), pool)}
         FIGURES.write_text(json.dumps({**before, "litert": found}, indent=1) + "\n", encoding="utf-8")
+    elif options.litert_web:
+        from tests import known
+        from tests.litert import sweep as litert
+
+        with RuntimePool() as pool:
+            found = {"date": _today(), **litert.sweep_web(known.sources(), pool)}
+        FIGURES.write_text(json.dumps({**before, "litert-web": found}, indent=1) + "\n", encoding="utf-8")
     elif options.programs:
         from tests import known
         from tests.programs import sweep as programs
@@ -381,7 +401,7 @@ def main() -> int:
         if options.only:
             print(page(content))
             return 1 if content["failed"] else 0
-        kept = {key: before[key] for key in ("unity", "litert", "programs") if key in before}
+        kept = {key: before[key] for key in ("unity", "litert", "litert-web", "programs") if key in before}
         FIGURES.write_text(json.dumps({**content, **kept}, indent=1) + "\n", encoding="utf-8")
     content = json.loads(FIGURES.read_text(encoding="utf-8"))
     PAGE.write_text(page(content), encoding="utf-8")

@@ -1,10 +1,12 @@
 """Every policy at hand as a .tflite: what is written, what acts alike in LiteRT, what comes back byte for byte.
 
-``python -m tests.figures --litert`` writes the counts into docs/figures.
+``python -m tests.figures --litert`` writes the counts into docs/figures, ``--litert-web`` those of LiteRT.js. Of that a
+line of JSON for each file goes to ``build/litert-web.jsonl``; files that stand there are not run again.
 """
 
 from __future__ import annotations
 
+import json
 import sys
 import tempfile
 from collections import Counter
@@ -22,11 +24,18 @@ from converters.runtimes.pool import RuntimePool
 from exporter.export.job import contract_of
 from exporter.export.pipeline import ExportOptions, export
 from exporter.export.sources import read_source
+from exporter.reports.summary import failure_lines
 from exporter.verify.options import VerifyOptions
 from signatures.contract import safe_name
 from signatures.errors import ExportModelError
+from signatures.roles import Role
+from tests import known
 
 RUNTIMES = ("litert", "litert-plain")
+WEB = "litert-web"
+#: Agents that a file for LiteRT.js is made for; more where classes are drawn, which takes thousands of runs of one.
+AGENTS, DRAWN_AGENTS = 1, 64
+LINES = Path(__file__).resolve().parents[2] / "build" / "litert-web.jsonl"
 
 
 def written(policy: Policy, text: str) -> bytes:
@@ -79,3 +88,63 @@ def sweep(files: Sequence[Path], pool: RuntimePool) -> dict[str, Any]:
                     failed.append(f"{file.parent.name}/{result.policy.name}")
             counts["same"] += sum(first == second for first, second in round_trips(file, Path(scratch)))
     return {**counts, "refused": dict(refused), "failed": failed}
+
+
+def agents(source: Path) -> int:
+    """How many agents a source's file for LiteRT.js is made for. Raises ExportModelError."""
+    drawn = any(s.role is Role.SAMPLED for p in read_source(source).policies() for s in p.signature.outputs)
+    return DRAWN_AGENTS if drawn else AGENTS
+
+
+def _web_line(file: Path, pool: RuntimePool) -> dict[str, Any]:
+    """What became of a file's policies in Chromium; without ``onnx`` where it is not written as ONNX."""
+    record: dict[str, Any] = {"file": str(file.relative_to(known.SHARED)), "agree": 0, "failed": []}
+    with tempfile.TemporaryDirectory() as scratch:
+        try:
+            onnx = list(export([file], ExportOptions(Path(scratch, "onnx"), ("onnx",), verify="none")))
+        except ExportModelError:
+            return record
+        record |= {"onnx": len(onnx), "batch": agents(file)}
+        options = ExportOptions(
+            Path(scratch, "litert"),
+            ("litert",),
+            verify=(WEB,),
+            batch=record["batch"],
+            parity=VerifyOptions(seed=3),
+        )
+        try:
+            for result in export([file], options, pool=pool):
+                assert result.report is not None
+                if result.report.passed is True:
+                    record["agree"] += 1
+                else:
+                    record["failed"].append({"policy": result.policy.name, "why": failure_lines(result.report)[:3]})
+        except ExportModelError as error:
+            record["refused"] = error.what
+    return record
+
+
+def sweep_web(files: Sequence[Path], pool: RuntimePool, kept: Path = LINES) -> dict[str, Any]:
+    """The counts of LiteRT.js, as JSON; files that ``kept`` has are taken from there."""
+    kept.parent.mkdir(exist_ok=True)
+    before = {r["file"]: r for r in map(json.loads, kept.read_text().splitlines())} if kept.is_file() else {}
+    with kept.open("a") as out:
+        for number, file in enumerate(files, 1):
+            name = str(file.relative_to(known.SHARED))
+            if name not in before:
+                print(f"{number} of {len(files)}: {name}", file=sys.stderr, flush=True)
+                before[name] = _web_line(file, pool)
+                out.write(json.dumps(before[name]) + "\n")
+                out.flush()
+    records = [r for r in (before[str(f.relative_to(known.SHARED))] for f in files) if "onnx" in r]
+    refused: Counter[str] = Counter()
+    for record in records:
+        if "refused" in record:
+            refused[record["refused"]] += record["onnx"]
+    return {
+        "onnx": sum(r["onnx"] for r in records),
+        "agree": sum(r["agree"] for r in records),
+        "one": sum(r["onnx"] for r in records if r["batch"] == AGENTS),
+        "refused": dict(refused),
+        "failed": [f"{Path(r['file']).parent.name}/{f['policy']}" for r in records for f in r["failed"]],
+    }

@@ -13,14 +13,12 @@ from converters.runtimes.pool import RuntimePool
 from converters.runtimes.registry import available_runtimes
 from exporter.api import verify_bundle
 from exporter.export.pipeline import ExportOptions, ExportResult, export
-from exporter.export.sources import read_source
 from exporter.reports.summary import failure_lines
 from fixtures import FIXTURES, path
-from signatures.roles import Role
 from tests import known
 from tests.conftest import Chosen
+from tests.litert.sweep import WEB, agents
 
-WEB = "litert-web"
 pytestmark = [pytest.mark.browser, pytest.mark.slow, pytest.mark.xdist_group("browser")]
 
 
@@ -35,9 +33,7 @@ def page() -> Iterator[RuntimePool]:
 
 def exported(source: Path, folder: Path, pool: RuntimePool, batch: int | None = 0) -> list[ExportResult]:
     """For one agent; where classes are drawn, which takes thousands of runs of one, for several."""
-    if batch == 0:
-        drawn = any(s.role is Role.SAMPLED for p in read_source(source).policies() for s in p.signature.outputs)
-        batch = 64 if drawn else 1
+    batch = agents(source) if batch == 0 else batch
     return list(export([source], ExportOptions(folder, ("litert",), verify=(WEB,), batch=batch), pool=pool))
 
 
