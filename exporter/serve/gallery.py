@@ -36,8 +36,9 @@ p { margin: 2px 0; color: var(--soft); }
 ul { list-style: none; margin: 24px 0 0; padding: 0; display: grid; gap: 20px; }
 ul { grid-template-columns: repeat(auto-fill, minmax(min(320px, 100%), 1fr)); }
 li { background: var(--sheet); border-radius: 12px; padding: 14px 16px 16px; }
-img { display: block; width: 100%; height: auto; aspect-ratio: 16 / 9; object-fit: contain; }
-img { background: #f4f6f8; border-radius: 8px; }
+li { display: grid; grid-template-rows: 1fr auto auto; }
+/* What is cut off is the rim that a picture has of the page it was taken from. */
+img { display: block; width: 100%; height: auto; align-self: center; clip-path: inset(2px round 12px); }
 a { color: var(--accent); } a:focus-visible { outline: 2px solid var(--accent); outline-offset: 2px; }
 """
 _PAGE = """\
