@@ -1,9 +1,10 @@
-"""Trained policies to try everything with, as fixtures/trained made them: 3DBall (18.8 kB), Hallway (33.2 kB)."""
+"""Policies to try everything with. 3DBall, Hallway (it has an LSTM), GridWorld and Tennis are the frozen graphs that
+training left in fixtures/trained; 3DBall.pt and the ONNX of others are of fixtures/torch_checkpoint and fixtures/sb3.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-#: The frozen graphs that training left. Hallway has an LSTM.
-BALL = Path(__file__).resolve().parent / "3DBall.bytes"
-HALLWAY = BALL.with_name("Hallway.bytes")
+FOLDER = Path(__file__).resolve().parent
+BALL = FOLDER / "3DBall.bytes"

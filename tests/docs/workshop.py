@@ -1,4 +1,4 @@
-"""A folder in which the names that the documentation uses exist, and what runs its blocks there."""
+"""A folder with the files to try, and what runs the blocks of a page there."""
 
 from __future__ import annotations
 
@@ -12,58 +12,22 @@ import tomllib
 import urllib.request
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from converters.formats.barracuda.vocabulary import Activation, LayerType
-from exporter.export.pipeline import ExportOptions, export
-from fixtures import path as fixture
-from tests.barracuda.nn_files import Maker, write_nn
+from exporter.demo.files import write_files
 from tests.commands import PLACES, ROOT
 from tests.docs.blocks import Block
 
-TRAINED = ROOT / "fixtures/trained/3DBall"
 #: First on PYTHONPATH, a module there makes ``auto`` stand for onnxruntime.
 NARROW = ROOT / "tests/docs/narrow"
 MODULES = ROOT / "converters/runtimes/javascript/js/node_modules"
 
 
 def furnish(folder: Path) -> None:
-    """Make what the pages take for given: see each line."""
-    shutil.copytree(TRAINED, folder / "results/first_run/3DBall")
-    (folder / "results/second_run/3DBall").mkdir(parents=True)
-    for name in ("3DBall-250000.pt", "3DBall-500000.pt", "checkpoint.pt"):
-        shutil.copy(ROOT / "fixtures/torch_checkpoint/ppo_1_1.pt", folder / "results/second_run/3DBall" / name)
-    shutil.copy(TRAINED / "frozen_graph_def.pb", folder / "3DBall.bytes")
-    shutil.copy(TRAINED / "frozen_graph_def.pb", folder / "frozen_graph_def.pb")
-    shutil.copy(fixture("recurrent"), folder / "runner.bytes")
-    (folder / "3DBall.nn").write_bytes(small_nn())
-    for name in ("sb3_discrete.onnx", "torch_actor.onnx", "torch_actor.onnx.data"):
-        shutil.copy(ROOT / "fixtures/sb3" / name, folder)
-    sources = [folder / "3DBall.bytes", folder / "runner.bytes"]
-    list(export(sources, ExportOptions(folder / "exported", verify="none")))
-    bundle = folder / "exported/3DBall"
-    for place in ("out", "last_week", "today"):
-        shutil.copytree(bundle, folder / place / "3DBall")
-    shutil.copytree(bundle / "saved_model", folder / "saved_model")
-    shutil.copytree(bundle / "tfjs", folder / "their_tfjs")
-    shutil.copy(bundle / "3DBall.onnx", folder / "theirs.onnx")
-    shutil.copy(bundle / "3DBall.onnx", folder / "3DBall.onnx")
-    (folder / "fixtures").symlink_to(ROOT / "fixtures")
+    """What a reader has who typed ``export-model demo --files`` there, and installed npm's packages."""
+    write_files(folder)
     if MODULES.is_dir():
         (folder / "node_modules").symlink_to(MODULES)
-
-
-def small_nn() -> bytes:
-    """A Barracuda model of 3DBall's size."""
-    random = np.random.default_rng(0)
-    maker = Maker()
-    value = maker.input("vector_observation", 1, 1, 8)
-    for name, size, activation in (("hidden", 16, Activation.TANH), ("action", 2, Activation.NONE)):
-        before = 8 if name == "hidden" else 16
-        weights = {"kernel": random.normal(size=(before, 1, 1, size)) * 0.4, "bias": np.zeros((1, 1, 1, size))}
-        value = maker.layer(name, LayerType.DENSE, value, data=weights, activation=activation)
-    return write_nn(maker.model())
 
 
 class Workshop:

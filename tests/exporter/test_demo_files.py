@@ -29,11 +29,13 @@ def test_each_file_is_a_policy_that_is_read(there: Path) -> None:
     assert [line.split()[0] for line in ran.out.splitlines()] == [*FILES, "next:"]
     assert {f for f in files_in(there) if (there / f).is_file()} == set(FILES)
     kinds = {}
-    policies = [name for name in FILES if not name.endswith(".py")]
+    policies = [name for name in FILES if not name.endswith((".py", ".data"))]
     for name in policies:
-        (policy,) = export_model("inspect", name, "--json").json["policies"]
+        policy, *others = export_model("inspect", name, "--json").json["policies"]
         kinds[name] = policy["name"], bool(policy["memory"])
-    assert [kinds[name][0] for name in policies] == ["3DBall", "3DBall", "3DBall", "Hallway", "3DBall", "Hallway"]
+        assert [p["name"] for p in others] == (["Tennis-RightBrain"] if name == "Tennis.bytes" else [])
+    assert len(kinds) == 13
+    assert [kinds[name][0] for name in policies[:6]] == [*["3DBall"] * 3, "Hallway", "GridWorld", "Tennis-LeftBrain"]
     assert [name for name, (_, memory) in kinds.items() if memory] == [n for n in policies if "Hallway" in n]
     names = [p["name"] for p in export_model("inspect", "results/first_run", "--json").json["policies"]]
     assert names == ["3DBall", "Hallway"]

@@ -12,13 +12,13 @@ import pytest
 
 from converters.formats.frozen_graph.reader import read_graph
 from converters.runtimes.pool import RuntimePool
-from exporter import export_model, inspect_model
-from exporter.demo import BALL, HALLWAY
+from exporter import demo, export_model, inspect_model
 from exporter.play.environments import ENVIRONMENTS
+from fixtures import FOLDER as FIXTURES
 from fixtures import trained
 from fixtures.evaluate import play
 from fixtures.goldens import read_npz
-from fixtures.trained import FOLDER, TRAINED, run_folder, weights_file
+from fixtures.trained import DEMONSTRATED, FOLDER, TRAINED, run_folder, weights_file
 from fixtures.trained.scores import README, decide, in_readme
 from tests.commands import ROOT
 from tests.trained.conftest import Stage
@@ -134,5 +134,9 @@ def test_numpy_weights_and_the_exported_policy_decide_alike(stage: Stage, name: 
 
 
 def test_the_demo_has_the_policies_that_were_trained() -> None:
-    for demo in (BALL, HALLWAY):
-        assert demo.read_bytes() == (FOLDER / demo.stem / "frozen_graph_def.pb").read_bytes()
+    made = {f"{name}.bytes": FOLDER / name / "frozen_graph_def.pb" for name in DEMONSTRATED}
+    made |= {n: FIXTURES / "sb3" / n for n in ("sb3_discrete.onnx", "torch_actor.onnx", "torch_actor.onnx.data")}
+    made["3DBall.pt"] = FIXTURES / "torch_checkpoint" / "ppo_1_1.pt"
+    there = {p.name for p in demo.FOLDER.iterdir() if p.suffix in (".bytes", ".onnx", ".data", ".pt")}
+    assert there == set(made)
+    assert [n for n, path in made.items() if (demo.FOLDER / n).read_bytes() != path.read_bytes()] == []
