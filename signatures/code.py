@@ -6,9 +6,8 @@ import math as numbers
 from collections.abc import Mapping
 from typing import Any
 
-from msgspec import Struct
-
 from signatures.errors import UsageError
+from signatures.fields import Record
 
 #: Option → what it may say, the usual one first.
 CHOICES: Mapping[str, tuple[str, ...]] = {
@@ -18,7 +17,7 @@ CHOICES: Mapping[str, tuple[str, ...]] = {
 }
 
 
-class CodeOptions(Struct, frozen=True):
+class CodeOptions(Record, frozen=True):
     """What source code is asked for beside the policy.
 
     ``math``: the functions of the language's library, or our own, with the same bits on every processor. ``weights``:
@@ -30,11 +29,6 @@ class CodeOptions(Struct, frozen=True):
     weights: str = "source"
     outputs: str = "actor"
     guard: float | None = None
-
-    def to_dict(self) -> dict[str, Any]:
-        """What is not as usual, as a contract says it."""
-        said = {key: value for key in CHOICES if (value := getattr(self, key)) != CHOICES[key][0]}
-        return said if self.guard is None else {**said, "guard": self.guard}
 
     @classmethod
     def of(cls, tool: Mapping[str, Any]) -> CodeOptions:

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from msgspec import Struct
 
+from signatures.fields import Record, Shape, Text
 
-class SourcePart(Struct, frozen=True):
+
+class SourcePart(Record, frozen=True):
     """A tensor of the source that holds some columns of the memory [B, n]: ``shape`` has None where its batch is.
 
     PyTorch's states are [layers, B, hidden]; a row of them is layer after layer.
     """
 
-    tensor: str
-    shape: tuple[int | None, ...]
+    tensor: Text
+    shape: Shape
 
     @property
     def axis(self) -> int:
@@ -28,10 +29,6 @@ class SourcePart(Struct, frozen=True):
     def size(self) -> int:
         """Numbers per row."""
         return math.prod(d for d in self.shape if d is not None)
-
-    def to_dict(self) -> dict[str, Any]:
-        """As in policy.json."""
-        return {"tensor": self.tensor, "shape": list(self.shape)}
 
 
 def split_memory(parts: Sequence[SourcePart], memory: np.ndarray) -> dict[str, np.ndarray]:

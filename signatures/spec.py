@@ -3,17 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-from msgspec import Struct, field
+from msgspec import Meta, Struct, field
 
+from signatures.fields import Many, Number, Record, Shape, Size, Text, Whole, explicit_default, one_of
 from signatures.interface import Interface
 from signatures.memories import SourcePart
-from signatures.roles import OBSERVATIONS, Constant, Role
+from signatures.roles import OBSERVATIONS, Role
+
+#: What tensors may be of.
+DTYPES = (
+    *("bool", "float16", "float32", "float64", "int8", "int16", "int32", "int64"),
+    *("uint8", "uint16", "uint32", "uint64"),
+)
+Dtype = Annotated[str, one_of(DTYPES)]
 
 
-class TensorSpec(Struct, frozen=True):
+class TensorSpec(Record, frozen=True):
     """One input or output.
 
     ``shape`` has None for a free axis (the batch comes first). ``dtype`` is numpy's name. ``source`` is the tensor of
@@ -21,25 +29,12 @@ class TensorSpec(Struct, frozen=True):
     was made here. ``distribution`` describes what an input looks like: ``{"kind": "normal", "mean": […], "std": […]}``.
     """
 
-    name: str
+    name: Text
     role: Role
-    dtype: str
-    shape: tuple[int | None, ...]
-    source: str | tuple[str, ...] | None = None
+    dtype: Dtype
+    shape: Shape
+    source: Text | Many[Text] | None = explicit_default(lambda: None)
     distribution: Mapping[str, Any] | None = None
-
-    def to_dict(self) -> dict[str, Any]:
-        """As in policy.json."""
-        entry: dict[str, Any] = {
-            "name": self.name,
-            "role": self.role.value,
-            "dtype": self.dtype,
-            "shape": list(self.shape),
-            "source": list(self.source) if isinstance(self.source, tuple) else self.source,
-        }
-        if self.distribution is not None:
-            entry["distribution"] = dict(self.distribution)
-        return entry
 
     def __repr__(self) -> str:
         return f"<{self.name!r}: {self.role.value}, {self.dtype} {self.shape_text}>"
@@ -71,22 +66,17 @@ class TensorSpec(Struct, frozen=True):
         return self.role is Role.CONTINUOUS or (self.role is Role.DETERMINISTIC and self.dtype.startswith("float"))
 
 
-class Memory(Struct, frozen=True):
+class Memory(Record, frozen=True):
     """Recurrent state: ``size`` floats per agent, fed as ``input`` and read from ``output`` (None where the source
     has lost it). ``layout`` names its parts in order, for example ``("c", "h")``, or is empty where it is unknown.
     ``others`` are further (input, output) pairs of a memory in several tensors, a part of ``layout`` each.
     """
 
-    size: int
-    input: str | None
-    output: str | None
-    layout: tuple[str, ...] = ()
-    others: tuple[tuple[str, str], ...] = ()
-
-    def to_dict(self) -> dict[str, Any]:
-        """As in policy.json."""
-        entry = {"size": self.size, "input": self.input, "output": self.output, "layout": list(self.layout)}
-        return {**entry, "others": [list(pair) for pair in self.others]} if self.others else entry
+    size: Size
+    input: Text | None
+    output: Text | None
+    layout: Many[Text] = explicit_default(tuple)
+    others: Many[tuple[Text, Text]] = ()
 
 
 class ActionHead(Struct, frozen=True):
@@ -112,20 +102,20 @@ def _companion(head: TensorSpec, plain: Sequence[TensorSpec], heads: int) -> Ten
     return next((s for s in plain if heads == 1 or s.is_continuous == head.is_continuous), None)
 
 
-class PolicySignature(Struct, frozen=True):
+class PolicySignature(Record, frozen=True, kw_only=True):
     """The contract of a policy, the same in every format it is written to."""
 
-    inputs: tuple[TensorSpec, ...]
-    outputs: tuple[TensorSpec, ...]
-    family: str
-    action_space: str  # continuous | discrete | hybrid
-    branches: tuple[int, ...] = ()
+    family: Text
     #: The training algorithm where the graph tells it: PPO, SAC, POCA, BC, DQN.
-    algorithm: str | None = None
-    memory: Memory | None = None
-    preprocess: Mapping[str, Any] = field(default_factory=dict)
-    constants: Mapping[str, Constant] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
+    algorithm: Text | None = explicit_default(lambda: None)
+    action_space: Annotated[str, one_of(("continuous", "discrete", "hybrid"))]
+    inputs: Many[TensorSpec]
+    outputs: Many[TensorSpec]
+    memory: Memory | None = explicit_default(lambda: None)
+    branches: Many[Annotated[int, Meta(ge=1, le=2**31 - 1)]] = explicit_default(tuple)
+    preprocess: Mapping[str, Any] = explicit_default(dict)
+    constants: Mapping[Text, Number | list[Whole]] = explicit_default(dict)
+    notes: Many[Text] = explicit_default(tuple)
     #: Names that people gave to observations and actions (signatures/labels.py); empty where they gave none.
     labels: Mapping[str, Any] = field(default_factory=dict)
     #: What sources state of units, scales and the control loop; None where none states anything.
@@ -202,23 +192,6 @@ class PolicySignature(Struct, frozen=True):
         """Inputs that take N(0, 1) draws."""
         return tuple(s for s in self.inputs if s.role is Role.NOISE)
 
-    def to_dict(self) -> dict[str, Any]:
-        """The part of policy.json that describes the policy (not its files)."""
-        return {
-            "family": self.family,
-            "algorithm": self.algorithm,
-            "action_space": self.action_space,
-            "inputs": [s.to_dict() for s in self.inputs],
-            "outputs": [s.to_dict() for s in self.outputs],
-            "memory": None if self.memory is None else self.memory.to_dict(),
-            "branches": list(self.branches),
-            "preprocess": dict(self.preprocess),
-            "constants": dict(self.constants),
-            "notes": list(self.notes),
-            **({"labels": dict(self.labels)} if self.labels else {}),
-            **({"interface": self.interface.to_dict()} if self.interface else {}),
-        }
-
 
 def _short(specs: Sequence[TensorSpec]) -> str:
     """The first of them, and how many more there are."""
@@ -237,7 +210,7 @@ def _spec_named(specs: tuple[TensorSpec, ...], name: str) -> TensorSpec:
     raise KeyError(name)
 
 
-class SourceMap(Struct, frozen=True):
+class SourceMap(Record, frozen=True):
     """How to run the source itself: which of its tensors stand for the policy's inputs and outputs.
 
     - ``fixed``: placeholders that the policy no longer has, with the value they take.
@@ -253,13 +226,13 @@ class SourceMap(Struct, frozen=True):
 
     feeds: Mapping[str, str] = field(default_factory=dict)
     fetches: Mapping[str, str] = field(default_factory=dict)
-    fixed: Mapping[str, np.ndarray] = field(default_factory=dict)
-    batch_sizes: Mapping[str, int] = field(default_factory=dict)
-    noise: Mapping[str, tuple[int | None, ...]] = field(default_factory=dict)
-    noise_kept: bool = False
-    branches: tuple[str | None, ...] = ()
-    rows: int | None = None
-    parts: Mapping[str, tuple[SourcePart, ...]] = field(default_factory=dict)
+    fixed: Mapping[str, np.ndarray] = explicit_default(dict)
+    batch_sizes: Mapping[Text, Annotated[int, Meta(ge=0, le=1)]] = explicit_default(dict)
+    noise: Mapping[Text, Shape] = explicit_default(dict)
+    noise_kept: bool = explicit_default(bool)
+    branches: Many[Text | None] = explicit_default(tuple)
+    rows: Annotated[int, Meta(ge=1, le=2**63 - 1)] | None = explicit_default(lambda: None)
+    parts: Mapping[Text, Many[SourcePart]] = field(default_factory=dict)
 
     def all_fetches(self) -> list[str]:
         """Every tensor of the source that it may be asked for."""
@@ -272,15 +245,7 @@ class SourceMap(Struct, frozen=True):
 
     def to_dict(self) -> dict[str, Any]:
         """What policy.json keeps of it: feeds and fetches are the ``source`` of its inputs and outputs."""
-        return {
-            "fixed": {name: {"dtype": value.dtype.name, "value": value.tolist()} for name, value in self.fixed.items()},
-            "batch_sizes": dict(self.batch_sizes),
-            "noise": {name: list(shape) for name, shape in self.noise.items()},
-            "noise_kept": self.noise_kept,
-            "branches": list(self.branches),
-            "rows": self.rows,
-            **({"parts": {n: [p.to_dict() for p in parts] for n, parts in self.parts.items()}} if self.parts else {}),
-        }
+        return {key: value for key, value in super().to_dict().items() if key not in ("feeds", "fetches")}
 
 
 def sources(specs: tuple[TensorSpec, ...], parts: Collection[str]) -> dict[str, str]:

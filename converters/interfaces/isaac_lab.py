@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import TypeVar
 
 from converters.interfaces.table import Table, short_text
-from signatures.interface import Interface, Quantity, Statement, Term
+from signatures.interface import Interface, Period, Quantity, Statement, Term
 
 _Entry = TypeVar("_Entry")
 #: The group of observations that the policy sees, as versions call it.
@@ -39,16 +39,18 @@ def read_descriptors(table: Table) -> Interface:
         joints = robot.texts("joint_names")
         for key, what in _OF_JOINTS.items():
             if values := robot.numbers(key):
-                quantities.append(Quantity(what, robot.where(key), values, elements=joints))
+                quantities.append(Quantity(name=what, source=robot.where(key), values=values, elements=joints))
         if clip := robot.ranges("default_joint_pos_limits"):
             limits.append(
-                Quantity("joint position", robot.where("default_joint_pos_limits"), clip=clip, elements=joints)
+                Quantity(
+                    name="joint position", source=robot.where("default_joint_pos_limits"), clip=clip, elements=joints
+                )
             )
     terms = tuple(_descriptor_term(row, ("joint_pos_offsets", "joint_vel_offsets")) for row in observations.rows(group))
     return Interface(
         observations={"": terms} if terms else {},
         actions=tuple(_descriptor_term(row, ("offset",)) for row in table.rows("actions")),
-        period=None if not period or period < 0 else (period, scene.where("dt")),
+        period=None if not period or period < 0 else Period(period, scene.where("dt")),
         limits=tuple(limits),
         quantities=tuple(quantities),
         kept=tuple(table.rest()),
@@ -100,7 +102,7 @@ def read_environment(table: Table) -> Interface:
     return Interface(
         observations={"": tuple(observed)} if observed else {},
         actions=tuple(acted),
-        period=(period, where) if period > 0 else None,
+        period=Period(period, where) if period > 0 else None,
         resets=tuple(resets),
         kept=tuple(table.rest()),
     )
@@ -111,8 +113,8 @@ def _configuration_term(entry: Table, name: str, frames: int | None) -> Term:
     own = entry.count("history_length")
     length = own if frames is None else frames
     return Term(
-        short_text(name),
-        entry.where(),
+        name=short_text(name),
+        source=entry.where(),
         scale=entry.numbers("scale"),
         offset=entry.numbers("offset") if entry.value("use_default_offset") is not True else (),
         clip=entry.ranges("clip"),
@@ -131,7 +133,7 @@ def read_agent(table: Table) -> Interface:
     ):
         bound = holder.number(key)
         if bound is not None and bound > 0:
-            limits.append(Quantity(name, holder.where(key), clip=((-bound, bound),)))
+            limits.append(Quantity(name=name, source=holder.where(key), clip=((-bound, bound),)))
     return Interface(limits=tuple(limits), kept=tuple(table.rest()))
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import PurePosixPath
 
 from converters.interfaces.table import Table, cut_text
-from signatures.interface import Interface, Statement, Term
+from signatures.interface import Interface, Period, Statement, Term
 
 _TARGETS = "target/"
 
@@ -42,7 +42,7 @@ def read_pipeline(table: Table, model: str) -> Interface:
     return Interface(
         observations=observations,
         actions=tuple(acted),
-        period=(1 / rate, configs.where("frequency")) if rate and 1e-9 < rate < 1e9 else None,
+        period=Period(1 / rate, configs.where("frequency")) if rate and 1e-9 < rate < 1e9 else None,
         resets=tuple(resets),
         kept=tuple(table.rest()),
     )
@@ -63,4 +63,6 @@ def _tensor(row: Table) -> Term:
     if names:
         row.take("element_names")
     row.take("dtype", "type")
-    return Term(row.text("name") or "tensor", row.where(), size, names if len(names) == size else ())
+    return Term(
+        name=row.text("name") or "tensor", source=row.where(), size=size, elements=names if len(names) == size else ()
+    )

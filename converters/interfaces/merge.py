@@ -20,8 +20,8 @@ def merge(first: Interface, second: Interface) -> tuple[Interface, tuple[str, ..
     observations = dict(first.observations)
     for name, terms in second.observations.items():
         observations[name] = _terms(observations.get(name, ()), terms, notes)
-    if first.period and second.period and abs(first.period[0] - second.period[0]) > 1e-6:
-        notes.append(_difference("the control period", first.period[1], second.period[1]))
+    if first.period and second.period and abs(first.period.seconds - second.period.seconds) > 1e-6:
+        notes.append(_difference("the control period", first.period.source, second.period.source))
     merged = Interface(
         observations=observations,
         actions=_terms(first.actions, second.actions, notes),

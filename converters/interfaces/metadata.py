@@ -37,15 +37,17 @@ def read_metadata(given: Mapping[str, str]) -> Interface | None:
     size = len(scale) if isinstance(table.value("action_scale"), list) else None
     named = joints if size in (None, len(joints)) else ()
     where = f"{table.where('action_scale')}, joint_names" if named else table.where("action_scale")
-    action = Term("action", where, size, named if size else (), scale=scale)
+    action = Term(name="action", source=where, size=size, elements=named if size else (), scale=scale)
     observed = _observations(table)
     quantities = tuple(
-        Quantity(name, table.where(key), values, elements=joints if len(joints) == len(values) else ())
+        Quantity(
+            name=name, source=table.where(key), values=values, elements=joints if len(joints) == len(values) else ()
+        )
         for key, name in _OF_JOINTS.items()
         if (values := table.numbers(key))
     )
     if joints and not any(q.elements for q in quantities):
-        quantities = (*quantities, Quantity("joints", table.where("joint_names"), elements=joints))
+        quantities = (*quantities, Quantity(name="joints", source=table.where("joint_names"), elements=joints))
     return Interface(
         observations={"": observed} if observed else {},
         actions=(action,) if scale else (),
@@ -71,9 +73,9 @@ def _observations(table: Table) -> tuple[Term, ...]:
         history = int(length[0]) if len(length) == 1 and 0 <= length[0] < 1 << 16 else None
         found.append(
             Term(
-                name,
-                table.where(f"observation_names[{i}]"),
-                len(scale) if len(scale) > 1 else None,
+                name=name,
+                source=table.where(f"observation_names[{i}]"),
+                size=len(scale) if len(scale) > 1 else None,
                 scale=scale,
                 clip=ranges_of(clips[i]) if clips else (),
                 history=None if history is None else max(history, 1),

@@ -116,7 +116,7 @@ def loop_lines(interface: Interface | None, most: int = FEW) -> list[str]:
         return []
     lines = []
     if interface.period is not None:
-        seconds, source = interface.period
+        seconds, source = interface.period.seconds, interface.period.source
         lines.append(f"a decision every {seconds:.6g} s ({1 / seconds:.6g} a second; {printable(source)})")
     lines += [f"{_statement_text(s)} ({printable(s.source)})" for s in interface.resets]
     lines += [f"limit of {_quantity(q, most)}" for q in interface.limits]

@@ -7,7 +7,7 @@ scales has one number for each of the term's, so it states the size.
 from __future__ import annotations
 
 from converters.interfaces.table import Table, short_text
-from signatures.interface import Interface, Quantity, Term
+from signatures.interface import Interface, Period, Quantity, Term
 
 _QUANTITIES = {
     "stiffness": "stiffness",
@@ -26,9 +26,9 @@ def read_deploy(table: Table) -> Interface:
     return Interface(
         observations={"": tuple(observed)} if observed else {},
         actions=tuple(acted),
-        period=None if not period or period < 0 else (period, table.where("step_dt")),
+        period=None if not period or period < 0 else Period(period, table.where("step_dt")),
         quantities=tuple(
-            Quantity(name, table.where(key), values)
+            Quantity(name=name, source=table.where(key), values=values)
             for key, name in _QUANTITIES.items()
             if (values := table.numbers(key))
         ),
@@ -48,10 +48,10 @@ def _term(entry: Table, name: str) -> Term:
     frames = entry.count("history_length")
     names = entry.texts("joint_names")
     return Term(
-        short_text(name),
-        entry.where(),
-        size,
-        names if size is not None and len(names) == size > 1 else (),
+        name=short_text(name),
+        source=entry.where(),
+        size=size,
+        elements=names if size is not None and len(names) == size > 1 else (),
         scale=scale,
         offset=offset if size is None or len(offset) in (1, size) else (),
         clip=clip if size is None or len(clip) in (1, size) else (),

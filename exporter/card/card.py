@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from msgspec import Struct, field
 from msgspec.structs import replace
 
 from converters.files.fetch import read_bytes
@@ -25,12 +26,24 @@ from exporter.tables import size_text
 from exporter.verify.plays import PlayRecord, read_plays
 from signatures.contract import PARITY, POLICY, Contract, json_of
 from signatures.errors import BundleError
-from signatures.fields import Field, FieldError
+from signatures.fields import Count, FieldError, Text, read
 
 CARD = "README.md"
 #: Snippets that a card shows, the first of which a bundle has the files for.
 _LOADED_BY = ("onnxruntime", "load-policy", "saved-model", "inference-engine", "policy-tfjs")
 _MOST_RECORD_BYTES = 16 << 20
+
+
+class _Runtime(Struct, frozen=True):
+    status: Text
+
+
+class _Agreement(Struct, frozen=True):
+    """What a card takes from parity.json."""
+
+    sentence: Text
+    seed: Count
+    runtimes: Mapping[Text, _Runtime] = field(default_factory=dict)
 
 
 def card_text(folder: Path) -> str:
@@ -134,17 +147,12 @@ def _agreement(folder: Path) -> list[str]:
     file = folder / PARITY
     if not file.is_file():
         return []
-    whole = _record(file)
     try:
-        runtimes = {name: entry["status"].text() for name, entry in whole["runtimes"].members().items()}
-        ran = ", ".join(sorted(name for name, status in runtimes.items() if status == "ran"))
-        return [text(whole["sentence"].text()), "", f"Compared in {text(ran) or 'no runtime'}; seed {_number(whole)}."]
+        found: _Agreement = read(json_of(read_bytes(file, most=_MOST_RECORD_BYTES)), _Agreement)
+        ran = ", ".join(sorted(name for name, runtime in found.runtimes.items() if runtime.status == "ran"))
+        return [text(found.sentence), "", f"Compared in {text(ran) or 'no runtime'}; seed {found.seed}."]
     except FieldError as error:
         raise BundleError(f"cannot be read: {error}", where=str(file), fix="verify the bundle again") from error
-
-
-def _number(whole: Field) -> int:
-    return whole["seed"].integer(0)
 
 
 def _loading(folder: Path) -> list[str]:
@@ -163,10 +171,6 @@ def _files(contract: Contract) -> list[str]:
     rows = [[code(p), size_text(entry.size), code(entry.sha256)] for p, entry in sorted(contract.files.items())]
     said = f"{code(POLICY)} has the whole contract; `export-model verify` checks these hashes."
     return [*markdown_table(("file", "size", "sha256"), rows), "", said]
-
-
-def _record(file: Path) -> Field:
-    return Field(json_of(read_bytes(file, most=_MOST_RECORD_BYTES)))
 
 
 def write_card(folder: Path) -> Path:

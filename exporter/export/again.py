@@ -394,7 +394,9 @@ def _baked_again(found: Source, contract: Contract) -> Job:
     """
     interface = contract.signature.interface
     if interface is not None:
-        raw = tuple(Quantity(t.name, t.source, clip=t.clip) for t in interface.baked if t.name == RAW_ACTION)
+        raw = tuple(
+            Quantity(name=t.name, source=t.source, clip=t.clip) for t in interface.baked if t.name == RAW_ACTION
+        )
         by_name = {t.name: t for t in interface.baked}
         actions = tuple(by_name.get(t.name, t) for t in interface.actions)
         interface = replace(interface, baked=(), actions=actions, limits=(*raw, *interface.limits))

@@ -24,7 +24,7 @@ from exporter.export.sources import Source
 from signatures.code import CodeOptions
 from signatures.contract import Contract, Origin, parse
 from signatures.errors import SignatureError, TooLargeError, UsageError, naming
-from signatures.fields import FieldError, printable, without_none
+from signatures.fields import FieldError, printable
 
 if TYPE_CHECKING:
     from converters.consumers.profile import Profile
@@ -138,7 +138,8 @@ def contract_of(
         normaliser=None if read.normaliser is None else printable(Path(read.normaliser).name),
     )
     said = None if code is None else code.to_dict() or None
-    made = without_none(profile=profile, weights=weights, batch=batch, code=said, bake=bake)
+    options = {"profile": profile, "weights": weights, "batch": batch, "code": said, "bake": bake}
+    made = {key: value for key, value in options.items() if value is not None}
     tool = {"name": "export-model", "version": __version__, **made}
     contract = Contract(policy.name, policy.signature, origin, policy.source, tool)
     try:

@@ -13,7 +13,7 @@ from converters.interfaces.merge import merge
 from converters.policy.policy import Policy
 from exporter.options_file import read_options
 from signatures.errors import UsageError
-from signatures.fields import Field, FieldError
+from signatures.fields import FieldError
 from signatures.interface import parse_interface
 from signatures.labels import validate_labels
 from signatures.spec import PolicySignature
@@ -63,7 +63,7 @@ def with_labels(policy: Policy, labels: Mapping[str, Any] | None, source: str = 
 def _with_interface(signature: PolicySignature, stated: Any, source: str) -> PolicySignature:
     """The signature with an interface that a person states, which goes before what files do. Raises UsageError."""
     try:
-        given = parse_interface(Field(_with_source(stated, source), "interface"), [s.name for s in signature.inputs])
+        given = parse_interface(_with_source(stated, source), [s.name for s in signature.inputs])
     except FieldError as error:
         raise UsageError(f"labels: {error}", fix="write it as policy.json does; see docs/interface.md") from error
     if given is None:

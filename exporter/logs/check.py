@@ -18,22 +18,19 @@ from exporter.logs.replay import Replay
 from exporter.logs.search import LEAST, explain
 from exporter.logs.trials import Trials, Verdict
 from exporter.verify.tolerances import Tolerance
+from signatures.fields import Record
 
 if TYPE_CHECKING:
     from exporter.acting.policy import LoadedPolicy
 
 
-class WorstStep(Struct, frozen=True):
+class WorstStep(Record, frozen=True):
     """The element that is farthest from the answer: its step, name, and both numbers."""
 
     step: int
     column: str
     logged: float
     computed: float
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return {"step": self.step, "column": self.column, "logged": self.logged, "computed": self.computed}
 
 
 class LogReport(Struct, frozen=True):

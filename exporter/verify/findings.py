@@ -11,10 +11,10 @@ from converters.files.children.process import RunFailedError
 from exporter.verify.difference import by_decade
 from exporter.verify.statistics import FALSE_ALARM
 from exporter.verify.tolerances import Tolerance
-from signatures.fields import without_none
+from signatures.fields import Record, explicit_default
 
 
-class Bisection(Struct, frozen=True):
+class Bisection(Record, frozen=True):
     """Where a disagreement begins: the first tensor in graph order that differs in that runtime.
 
     ``source`` is the tensor of the source that it stands for. ``index`` is where the worst element is, ``expected`` and
@@ -23,13 +23,13 @@ class Bisection(Struct, frozen=True):
     """
 
     tensor: str | None
-    op: str | None = None
-    source: str | tuple[str, ...] | None = None
-    index: tuple[int, ...] | None = None
-    expected: float | None = None
-    got: float | None = None
-    max_abs_diff: float | None = None
-    smallest_tolerance: float | None = None
+    op: str | None = explicit_default(lambda: None)
+    source: str | tuple[str, ...] | None = explicit_default(lambda: None)
+    index: tuple[int, ...] | None = explicit_default(lambda: None)
+    expected: float | None = explicit_default(lambda: None)
+    got: float | None = explicit_default(lambda: None)
+    max_abs_diff: float | None = explicit_default(lambda: None)
+    smallest_tolerance: float | None = explicit_default(lambda: None)
     hidden: tuple[str, ...] = ()
     #: What was fed where that is not the comparison's worst input: the first step that differs.
     input: str | None = None
@@ -39,15 +39,7 @@ class Bisection(Struct, frozen=True):
         """As in parity.json."""
         if self.tensor is None:
             return {"tensor": None, "reason": self.reason}
-        numbers = {k: getattr(self, k) for k in ("expected", "got", "max_abs_diff", "smallest_tolerance")}
-        return {
-            "tensor": self.tensor,
-            "op": self.op,
-            "source": list(self.source) if isinstance(self.source, tuple) else self.source,
-            "index": None if self.index is None else list(self.index),
-            **{k: None if v is None else _number(v) for k, v in numbers.items()},
-            **without_none(hidden=list(self.hidden) or None, input=self.input, reason=self.reason or None),
-        }
+        return {k: _number(v) if isinstance(v, float) else v for k, v in super().to_dict().items()}
 
     def sentence(self) -> str:
         """Where it begins, in a line."""
@@ -168,6 +160,16 @@ class Finding(Struct, frozen=True):
 
     def to_dict(self) -> dict[str, Any]:
         """As in parity.json."""
+        told = {
+            "tolerance_reason": self.tolerance.reason,
+            "rounding": self.rounding,
+            "reason": self.reason,
+            "drift": [_number(d) for d in self.drift],
+            "histogram": by_decade(self.histogram) if any(self.histogram) else None,
+            "smallest_tolerance": None if self.passed else self.smallest_tolerance,
+            "bisection": None if self.bisection is None else self.bisection.to_dict(),
+            "against": self.against,
+        }
         return {
             "format": self.format,
             "runtime": self.runtime,
@@ -180,16 +182,7 @@ class Finding(Struct, frozen=True):
             "rtol": self.tolerance.rtol,
             "passed": self.passed,
             "worst_input": self.worst_input,
-            **without_none(
-                tolerance_reason=self.tolerance.reason or None,
-                rounding=self.rounding or None,
-                reason=self.reason or None,
-                drift=[_number(d) for d in self.drift] or None,
-                histogram=by_decade(self.histogram) if any(self.histogram) else None,
-                smallest_tolerance=None if self.passed else self.smallest_tolerance,
-                bisection=None if self.bisection is None else self.bisection.to_dict(),
-                against=self.against or None,
-            ),
+            **{key: value for key, value in told.items() if value or (key == "smallest_tolerance" and value == 0)},
         }
 
 

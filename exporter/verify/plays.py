@@ -6,17 +6,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from converters.files.fetch import read_bytes
 from signatures.contract import PARITY, json_of
 from signatures.errors import BundleError
-from signatures.fields import Field, FieldError
+from signatures.fields import Blank, Count, FieldError, Real, Text, one_of, read
 
 EQUIVALENT, DIFFERENT, NOT_DECIDED = "EQUIVALENT", "DIFFERENT", "NOT DECIDED"
 VERDICTS = (EQUIVALENT, DIFFERENT, NOT_DECIDED)
+_Verdict = Annotated[str, one_of(VERDICTS)]
 #: Of every interval that is kept.
 CONFIDENCE = 0.95
 #: One parity.json, and the environments in it.
@@ -112,54 +113,73 @@ def _player(player: Player) -> dict[str, Any]:
     }
 
 
+class _Margin(Struct, frozen=True):
+    asked: Text
+    value: Real
+
+
+class _Own(Struct, frozen=True):
+    name: Text
+    episodes: Annotated[int, Meta(ge=1, le=2**63 - 1)]
+    mean_return: Real
+    return_interval: tuple[Real, Real]
+
+    @property
+    def returns(self) -> Interval:
+        return Interval(self.mean_return, *self.return_interval)
+
+
+class _Compared(_Own, frozen=True):
+    verdict: _Verdict
+    difference: Real
+    interval: tuple[Real, Real]
+    sentence: Blank
+
+    @property
+    def player(self) -> Player:
+        difference = Interval(self.difference, *self.interval)
+        return Player(self.name, self.returns, self.episodes, self.verdict, difference, self.sentence)
+
+
+class _Kept(Struct, frozen=True):
+    """A record as parity.json has it."""
+
+    environment: Text
+    verdict: _Verdict
+    sentence: Text
+    seed: Count
+    margin: _Margin
+    reference: _Own
+    players: Annotated[tuple[_Compared, ...], Meta(max_length=10_000)] = ()
+    deterministic: bool = False
+
+
+class _Report(Struct, frozen=True):
+    played: Annotated[tuple[_Kept, ...], Meta(max_length=_MOST_RECORDS)] = ()
+
+
 def read_plays(folder: Path) -> tuple[PlayRecord, ...]:
     """Return what the parity.json of a bundle says of playing; nothing without one. Raises BundleError."""
     file = folder / PARITY
     if not file.is_file():
         return ()
     try:
-        whole = Field(json_of(read_bytes(file, most=_MOST_BYTES)))
-        return tuple(_record(entry) for entry in whole["played"].items(_MOST_RECORDS))
+        report: _Report = read(json_of(read_bytes(file, most=_MOST_BYTES)), _Report)
     except FieldError as error:
         raise BundleError(
             f"cannot be read: {error}", where=str(file), fix="export the bundle again, or delete the file"
         ) from error
-
-
-def _record(entry: Field) -> PlayRecord:
-    margin = entry["margin"]
-    return PlayRecord(
-        environment=entry["environment"].text(),
-        verdict=entry["verdict"].one_of(VERDICTS),
-        sentence=entry["sentence"].text(),
-        seed=entry["seed"].integer(0),
-        deterministic=entry["deterministic"].truth(),
-        asked=margin["asked"].text(),
-        margin=float(margin["value"].number()),
-        reference=_read_player(entry["reference"]),
-        players=tuple(_read_compared(p) for p in entry["players"].items(10_000)),
+    return tuple(
+        PlayRecord(
+            environment=kept.environment,
+            verdict=kept.verdict,
+            sentence=kept.sentence,
+            seed=kept.seed,
+            deterministic=kept.deterministic,
+            asked=kept.margin.asked,
+            margin=kept.margin.value,
+            reference=Player(kept.reference.name, kept.reference.returns, kept.reference.episodes),
+            players=tuple(compared.player for compared in kept.players),
+        )
+        for kept in report.played
     )
-
-
-def _read_compared(entry: Field) -> Player:
-    own = _read_player(entry)
-    return Player(
-        own.name,
-        own.returns,
-        own.episodes,
-        entry["verdict"].one_of(VERDICTS),
-        _interval(entry["difference"], entry["interval"]),
-        entry["sentence"].text(blank=True),
-    )
-
-
-def _read_player(entry: Field) -> Player:
-    mean = _interval(entry["mean_return"], entry["return_interval"])
-    return Player(entry["name"].text(), mean, entry["episodes"].integer(1))
-
-
-def _interval(mean: Field, ends: Field) -> Interval:
-    numbers = [float(end.number()) for end in ends.items(2)]
-    if len(numbers) != 2:
-        raise ends.error("must be two numbers")
-    return Interval(float(mean.number()), *numbers)

@@ -181,7 +181,7 @@ def stub(inputs: list[TensorSpec], outputs: list[TensorSpec], answers: dict[str,
         fed.append(dict(feeds))
         return answers
 
-    signature = PolicySignature(tuple(inputs), tuple(outputs), "test", **more)  # type: ignore[arg-type]
+    signature = PolicySignature(inputs=tuple(inputs), outputs=tuple(outputs), family="test", **more)  # type: ignore[arg-type]
     return Stub(LoadedPolicy("stub", signature, run, "numpy"), fed)
 
 

@@ -59,7 +59,7 @@ def as_policy(sample: Sample) -> Policy | None:
             )
         )
         fetches[output] = name
-    signature = PolicySignature(tuple(specs), tuple(outputs), "test", "continuous")
+    signature = PolicySignature(inputs=tuple(specs), outputs=tuple(outputs), family="test", action_space="continuous")
     return Policy("sample", Graph(tuple(nodes)), signature, {s.name: s.name for s in specs}, fetches)
 
 

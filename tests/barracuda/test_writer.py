@@ -123,7 +123,9 @@ def handmade(nodes: list[Node], outputs: list[TensorSpec], action_space: str, br
     """A policy of one vector of four numbers."""
     given = TensorSpec("state", Role.VECTOR, "float32", (None, 4))
     place = Node("state", "Placeholder", attrs={"dtype": FLOAT32, "shape": TensorShape((None, 4))})
-    signature = PolicySignature((given,), tuple(outputs), "test", action_space, branches)
+    signature = PolicySignature(
+        inputs=(given,), outputs=tuple(outputs), family="test", action_space=action_space, branches=branches
+    )
     names = {s.name: s.name for s in outputs}
     return Policy("handmade", Graph((place, *nodes)), signature, {"state": "state"}, names)
 

@@ -260,10 +260,10 @@ def test_a_contract_that_is_no_object_is_refused(text: str, ball: Path) -> None:
 
 
 SPOILT: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
-    "no name": (lambda c: c.pop("name"), "name is not the name of a policy"),
-    "a name that leads out": (lambda c: c.update(name="../continuous"), "name is not the name"),
-    "a name of dots": (lambda c: c.update(name=".."), "name is not the name"),
-    "a name that is a number": (lambda c: c.update(name=3), "name is not the name"),
+    "no name": (lambda c: c.pop("name"), "name must be the name of a policy"),
+    "a name that leads out": (lambda c: c.update(name="../continuous"), "name must be the name"),
+    "a name of dots": (lambda c: c.update(name=".."), "name must be the name"),
+    "a name that is a number": (lambda c: c.update(name=3), "name must be the name"),
     "no files": (lambda c: c.pop("files"), "files is empty"),
     "files that are a list": (lambda c: c.update(files=["continuous.bytes"]), "files must be an object"),
     "a file without a hash": (

@@ -184,7 +184,9 @@ def test_what_is_not_a_number_stays_so() -> None:
 
 def signature(algorithm: str | None) -> PolicySignature:
     spec = TensorSpec("action", Role.CONTINUOUS, "float32", (None, 2))
-    return PolicySignature((spec,), (spec,), "own model", "continuous", algorithm=algorithm)
+    return PolicySignature(
+        inputs=(spec,), outputs=(spec,), family="own model", action_space="continuous", algorithm=algorithm
+    )
 
 
 def test_only_sac_has_a_wider_tolerance_and_says_why() -> None:

@@ -292,7 +292,7 @@ def test_an_action_without_chance_that_is_drawn_is_refused(exporting: Exporting,
 def test_verification_by_itself_fails_an_action_without_chance_that_is_drawn() -> None:
     """Where a graph comes to it that no compiler of ours has seen."""
     spec = TensorSpec("deterministic_action", Role.DETERMINISTIC, "float32", (None, 1))
-    signature = PolicySignature((), (spec,), "test", "continuous")
+    signature = PolicySignature(inputs=(), outputs=(spec,), family="test", action_space="continuous")
     found = plausible(signature, spec.name, np.zeros((2, 1), np.float32), Case("zeros", 2, {}))
     assert not found.passed
     assert "without chance, and it is drawn" in found.reason

@@ -135,7 +135,7 @@ def policy_of(graph: Graph, fetches: Sequence[str]) -> Policy:
     types = infer_types(graph)
     inputs = [_spec(n.name, types) for n in graph.nodes if n.op == "Placeholder"]
     outputs = [_spec(n, types) for n in names]
-    signature = PolicySignature(tuple(inputs), tuple(outputs), "test", "continuous")
+    signature = PolicySignature(inputs=tuple(inputs), outputs=tuple(outputs), family="test", action_space="continuous")
     return Policy("sample", graph, signature, {s.name: s.name for s in inputs}, {n: n for n in names})
 
 

@@ -121,7 +121,12 @@ def policy(made: Graph, outputs: Sequence[str], action: str = "action") -> Polic
 
     fed = feeds(made)
     inputs = tuple(spec(n, v) for n, v in fed.items())
-    signature = PolicySignature(inputs, tuple(spec(n, v) for n, v in run_graph(made, fed, outputs).items()), "t", "t")
+    signature = PolicySignature(
+        inputs=inputs,
+        outputs=tuple(spec(n, v) for n, v in run_graph(made, fed, outputs).items()),
+        family="t",
+        action_space="t",
+    )
     return Policy("sample", made, signature, {n: n for n in fed}, {n: n for n in outputs})
 
 

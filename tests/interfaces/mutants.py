@@ -20,7 +20,6 @@ from converters.interfaces.registry import read_interface
 from exporter.export.sources import read_source
 from signatures.contract import parse_signature
 from signatures.errors import ExportModelError
-from signatures.fields import Field
 from tests.interfaces.made import DONE, FILES, MJLAB, SEEN, write_onnx
 
 _WORDS = (
@@ -92,7 +91,7 @@ def try_mutant(number: int, folder: Path) -> str:
             read_interface(beside / name, "policy.onnx", "policy")
     source = write_onnx(folder / "exported" / "policy.onnx", SEEN, DONE, metadata)
     (policy,) = read_source(source, ReadOptions()).policies()
-    parse_signature(Field(policy.signature.to_dict()))  # what is written can be read back
+    parse_signature(policy.signature.to_dict())  # what is written can be read back
     left_out = any("is left out" in note for note in policy.signature.notes)
     return "left out" if left_out else "read" if policy.signature.interface else "states nothing"
 

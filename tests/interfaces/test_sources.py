@@ -12,7 +12,7 @@ from converters.formats.source import ReadOptions
 from converters.interfaces.registry import FILES as KINDS
 from exporter.export.sources import read_source
 from signatures.errors import DamagedFileError
-from signatures.interface import Interface, Term
+from signatures.interface import Interface, Period, Term
 from signatures.spec import PolicySignature
 from tests.commands import export_model
 from tests.interfaces.made import FILES, MJLAB, mjlab, run_with, write_onnx
@@ -68,7 +68,9 @@ def test_joints_that_are_not_the_actions_do_not_name_them(tmp_path: Path) -> Non
 def test_other_exporters_write_csv_or_json(tmp_path: Path, metadata: dict[str, str]) -> None:
     given = {"observation_names": "a,b" if "," in metadata["joint_names"][:4] else '["a", "b"]', **metadata}
     found = interface_of(write_onnx(tmp_path / "p.onnx", metadata=given))
-    assert found.actions == (Term("action", found.actions[0].source, 2, ("hip", "knee"), scale=(0.25, 0.5)),)
+    assert found.actions == (
+        Term(name="action", source=found.actions[0].source, size=2, elements=("hip", "knee"), scale=(0.25, 0.5)),
+    )
     assert [(t.name, t.history) for t in found.observations["state"]] == [("a", 1), ("b", 1)]
 
 
@@ -82,7 +84,7 @@ def test_io_descriptors_state_all(tmp_path: Path) -> None:
     (action,) = found.actions
     assert (action.scale, action.elements) == ((0.5,), ("hip", "knee"))
     assert action.offset == pytest.approx((0.4, -0.8))
-    assert found.period == (0.02, "IO_descriptors.yaml: scene.dt")
+    assert found.period == Period(0.02, "IO_descriptors.yaml: scene.dt")
     assert found.limits[0].clip == ((-0.75, 0.5), (-9.5, 9.5))
     assert "IO_descriptors.yaml: observations.critic" in {s.source for s in found.kept}
 
@@ -102,7 +104,7 @@ def test_env_yaml_states_terms_in_order_and_the_period(tmp_path: Path) -> None:
         None,
     )
     assert (joints.name, joints.history) == ("joint_pos_rel", 1)
-    assert found.period == (0.02, "env.yaml: sim.dt × decimation")
+    assert found.period == Period(0.02, "env.yaml: sim.dt × decimation")
     (action,) = found.actions
     assert (action.scale, action.offset) == ((0.5,), ())  # the default pose is added, which only the robot states
     assert [s.text for s in found.resets] == ["an episode lasts at most 20 s", "an episode ends at time_out"]
@@ -121,7 +123,7 @@ def test_deploy_yaml_states_sizes_by_its_lists(tmp_path: Path) -> None:
     (action,) = found.actions
     assert (action.scale, action.offset, action.elements) == ((0.25, 0.5), (0.4, -0.8), ())  # ".*" names no joint
     assert action.clip == ((-1.0, 1.0), (-2.5, 1.0))
-    assert found.period == (0.02, "deploy.yaml: step_dt")
+    assert found.period == Period(0.02, "deploy.yaml: step_dt")
 
 
 def test_leapp_states_names_by_tensor(tmp_path: Path) -> None:
@@ -148,7 +150,7 @@ def test_leapp_states_names_by_tensor(tmp_path: Path) -> None:
         ("state", "state_1"), ("shoulder", "elbow")
     )
     assert found.actions[0].elements == ("shoulder", "elbow")
-    assert found.period == (0.02, "arm.yaml: pipeline.configs.frequency")
+    assert found.period == Period(0.02, "arm.yaml: pipeline.configs.frequency")
 
 
 def test_configuration_yaml_states_the_memory_of_its_behavior(tmp_path: Path) -> None:
@@ -175,8 +177,8 @@ def test_labels_may_state_an_interface(tmp_path: Path) -> None:
     )
     assert ran.status == 0, ran.err
     found = interface_of(tmp_path / "out" / "p")
-    assert found.actions == (Term("joints", "labels.json", 2, unit="rad", scale=(0.5,)),)
-    assert found.period == (0.01, "labels.json")
+    assert found.actions == (Term(name="joints", source="labels.json", size=2, unit="rad", scale=(0.5,)),)
+    assert found.period == Period(0.01, "labels.json")
 
 
 def test_several_files_are_one_interface_and_contradictions_are_said(tmp_path: Path) -> None:
@@ -237,7 +239,7 @@ def test_descriptors_may_have_the_name_of_their_task(tmp_path: Path) -> None:
     path = run_with(tmp_path, "IO_descriptors.yaml", place="io_descriptors")
     folder = tmp_path / "io_descriptors"
     (folder / "IO_descriptors.yaml").rename(folder / "isaac_velocity_IO_descriptors.yaml")
-    assert interface_of(path).period == (0.02, "isaac_velocity_IO_descriptors.yaml: scene.dt")
+    assert interface_of(path).period == Period(0.02, "isaac_velocity_IO_descriptors.yaml: scene.dt")
 
 
 def test_a_behavior_in_a_folder_of_its_own_has_the_settings_of_its_run(tmp_path: Path) -> None:

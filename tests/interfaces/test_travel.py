@@ -14,8 +14,7 @@ from converters.formats.registry import WRITTEN
 from converters.formats.source import ReadOptions
 from exporter.export.sources import read_source
 from signatures.contract import EMBEDDED
-from signatures.fields import Field
-from signatures.interface import Interface, Quantity, Statement, Term, parse_interface
+from signatures.interface import Interface, Period, Quantity, Statement, Term, parse_interface
 from tests.commands import export_model
 from tests.interfaces.made import MJLAB, mjlab, run_with
 
@@ -119,24 +118,24 @@ numbers = st.floats(-1e6, 1e6)
 ranges = st.tuples(st.none() | st.floats(-9, 0), st.none() | st.floats(0, 9))
 terms = st.builds(
     Term,
-    names,
-    names,
-    st.just(2),
-    st.sampled_from([(), ("a", "b")]),
-    st.none() | names,
-    st.lists(numbers, max_size=2).map(tuple),
-    st.lists(numbers, max_size=2).map(tuple),
-    st.lists(ranges, max_size=2).map(tuple),
-    st.none() | st.integers(1, 9),
+    name=names,
+    source=names,
+    size=st.just(2),
+    elements=st.sampled_from([(), ("a", "b")]),
+    unit=st.none() | names,
+    scale=st.lists(numbers, max_size=2).map(tuple),
+    offset=st.lists(numbers, max_size=2).map(tuple),
+    clip=st.lists(ranges, max_size=2).map(tuple),
+    history=st.none() | st.integers(1, 9),
 )
 statements = st.builds(Statement, names, names)
-quantities = st.builds(Quantity, names, names, st.lists(numbers, max_size=3).map(tuple))
+quantities = st.builds(Quantity, name=names, source=names, values=st.lists(numbers, max_size=3).map(tuple))
 interfaces = st.builds(
     Interface,
     st.dictionaries(st.sampled_from(["state", "state_1"]), st.lists(terms, min_size=1, max_size=3).map(tuple)),
     st.lists(terms, max_size=2).map(tuple),
     st.lists(terms, max_size=2).map(tuple),
-    st.none() | st.tuples(st.floats(1e-6, 1e3), names),
+    st.none() | st.builds(Period, st.floats(1e-6, 1e3), names),
     *(st.lists(s, max_size=2).map(tuple) for s in (statements, quantities, quantities, statements)),
     st.dictionaries(names, st.text(st.characters(exclude_categories=("Cs",)), max_size=30), max_size=3),
 )
@@ -145,4 +144,4 @@ interfaces = st.builds(
 @given(interfaces)
 def test_json_gives_back_what_was_written(made: Interface) -> None:
     again = json.loads(json.dumps(made.to_dict(), allow_nan=False))
-    assert parse_interface(Field(again or None), ["state", "state_1"]) == (made or None)
+    assert parse_interface(again or None, ["state", "state_1"]) == (made or None)

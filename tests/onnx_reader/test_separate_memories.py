@@ -28,7 +28,6 @@ from exporter.reports.summary import failure_lines
 from exporter.verify import original
 from signatures.contract import parse_source_map
 from signatures.errors import SignatureError
-from signatures.fields import Field
 from signatures.memories import SourcePart, join_memory, split_memory
 from signatures.roles import Role
 from signatures.spec import Memory
@@ -412,13 +411,13 @@ def test_what_is_divided_is_joined_again(case: tuple[Sequence[Any], Array]) -> N
 
 def test_a_source_map_from_before_there_were_parts(tmp_path: Path) -> None:
     signature = compiled(recurrent("GRU"), tmp_path).signature
-    assert parse_source_map(Field({"rows": 1}), signature).parts == {}
-    assert parse_source_map(Field({"rows": 1}), signature).feeds["recurrent_in"] == "h_in"
+    assert parse_source_map({"rows": 1}, signature).parts == {}
+    assert parse_source_map({"rows": 1}, signature).feeds["recurrent_in"] == "h_in"
 
 
 @pytest.mark.parametrize("layers", [1, 2])
 def test_a_source_map_comes_back_from_policy_json(layers: int, tmp_path: Path) -> None:
     policy = compiled(recurrent("GRU", layers), tmp_path)
-    again = parse_source_map(Field(json.loads(json.dumps(policy.source.to_dict()))), policy.signature)
+    again = parse_source_map(json.loads(json.dumps(policy.source.to_dict())), policy.signature)
     assert again == policy.source
     assert "recurrent_in" not in again.feeds

@@ -29,7 +29,6 @@ from exporter.verify.checks.consumer import consumers
 from fixtures import path as fixture
 from signatures.contract import parse_signature
 from signatures.errors import ProfileError, UsageError
-from signatures.fields import Field
 from tests.commands import export_model as command
 from tests.commands import is_refused
 from tests.known import ABSENT, SHARED
@@ -273,7 +272,7 @@ def test_verify_and_the_contract_know_a_memory_in_two_tensors(export: Export) ->
     contract = json.loads((made.parent / "policy.json").read_text())
     assert contract["memory"]["others"] == [["c_in", "c_out"]]
     assert contract["tool"]["batch"] == 1
-    assert parse_signature(Field(contract)).recurrences == (("h_in", "h_out"), ("c_in", "c_out"))
+    assert parse_signature(contract).recurrences == (("h_in", "h_out"), ("c_in", "c_out"))
     report = verify_bundle(made.parent, source=FOREIGN / f"{ISAAC[2]}.onnx", runtimes="onnxruntime")
     assert report.passed
     assert "Isaac Lab" in report.sentence and "Unity" not in report.sentence

@@ -26,7 +26,7 @@ def test_what_is_drawn_is_left_out(op: str) -> None:
         for name, role in (("action", Role.CONTINUOUS), ("deterministic_action", Role.DETERMINISTIC))
     ]
     state = TensorSpec("state", Role.VECTOR, "float32", (None, 2), None)
-    signature = PolicySignature((state,), tuple(outputs), "test", "continuous")
+    signature = PolicySignature(inputs=(state,), outputs=tuple(outputs), family="test", action_space="continuous")
     policy = Policy("p", made, signature, {"state": "state"}, {s.name: s.name for s in outputs})
     inputs, given = signatures_of(policy)[DETERMINISTIC]
     assert [s.name for s in inputs] == ["state"]

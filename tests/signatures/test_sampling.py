@@ -27,7 +27,14 @@ ACTION = TensorSpec("action", Role.CONTINUOUS, "float32", (None, 2))
 
 
 def signature(*inputs: TensorSpec, branches: tuple[int, ...] = (), memory: Memory | None = None) -> PolicySignature:
-    return PolicySignature(inputs, (ACTION,), "own model", "continuous", branches, memory=memory)
+    return PolicySignature(
+        inputs=inputs,
+        outputs=(ACTION,),
+        family="own model",
+        action_space="continuous",
+        branches=branches,
+        memory=memory,
+    )
 
 
 def spec(name: str, role: Role, *shape: int | None, dtype: str = "float32", **distribution: Any) -> TensorSpec:

@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from signatures.contract import _RANKS, parse_signature, parse_source_map
-from signatures.fields import Field
 from signatures.roles import INPUT_ROLES, Role
 from signatures.spec import Memory, PolicySignature, SourceMap, TensorSpec
 
@@ -87,9 +86,9 @@ def through_json(content: dict[str, Any]) -> dict[str, Any]:
 @settings(max_examples=60, deadline=None)
 def test_a_signature_is_read_back(signature: PolicySignature) -> None:
     entry = through_json(signature.to_dict())
-    assert parse_signature(Field(entry)) == signature
-    assert parse_signature(Field({**entry, "files": {}, "schema": 1})) == signature
-    assert through_json(parse_signature(Field(entry)).to_dict()) == entry
+    assert parse_signature(entry) == signature
+    assert parse_signature({**entry, "files": {}, "schema": 1}) == signature
+    assert through_json(parse_signature(entry).to_dict()) == entry
 
 
 ARRAYS = st.one_of(
@@ -122,9 +121,9 @@ def test_how_to_run_the_source_is_read_back(
         TensorSpec("deterministic_action", Role.DETERMINISTIC, "float32", (None, 2), None),
         TensorSpec("recurrent_out", Role.MEMORY_OUT, "float32", (None, 2), ("c:0", "h:0")),
     )
-    signature = PolicySignature(inputs, outputs, "own model", "continuous")
+    signature = PolicySignature(inputs=inputs, outputs=outputs, family="own model", action_space="continuous")
     source = SourceMap({}, {}, fixed, batch_sizes, noise, kept, branches)
-    read = parse_source_map(Field(through_json(source.to_dict())), signature)
+    read = parse_source_map(through_json(source.to_dict()), signature)
     assert read.feeds == {"state": "vector_observation:0"}
     assert read.fetches["action"] == "action:0"
     assert "deterministic_action" not in read.fetches
@@ -135,15 +134,15 @@ def test_how_to_run_the_source_is_read_back(
 
 
 def test_an_empty_map_is_read_from_nothing() -> None:
-    signature = PolicySignature((), (), "own model", "continuous")
-    assert parse_source_map(Field({}), signature) == SourceMap()
+    signature = PolicySignature(inputs=(), outputs=(), family="own model", action_space="continuous")
+    assert parse_source_map({}, signature) == SourceMap()
 
 
 def test_tensors_are_found_by_name() -> None:
     state = TensorSpec("state", Role.VECTOR, "float32", (None, 3))
     noise = TensorSpec("epsilon", Role.NOISE, "float32", (None, 2))
     action = TensorSpec("action", Role.CONTINUOUS, "float32", (None, 2))
-    signature = PolicySignature((state, noise), (action,), "own model", "continuous")
+    signature = PolicySignature(inputs=(state, noise), outputs=(action,), family="own model", action_space="continuous")
     assert signature.input("epsilon") is noise
     assert signature.output("action") is action
     assert signature.observations == (state,)
@@ -156,7 +155,9 @@ def test_tensors_are_found_by_name() -> None:
 
 
 def test_the_parts_of_policy_json_are_in_their_order() -> None:
-    signature = PolicySignature((), (), "own model", "continuous", memory=Memory(4, "a", "b", ("c", "h")))
+    signature = PolicySignature(
+        inputs=(), outputs=(), family="own model", action_space="continuous", memory=Memory(4, "a", "b", ("c", "h"))
+    )
     assert list(signature.to_dict()) == [
         *("family", "algorithm", "action_space", "inputs", "outputs", "memory", "branches"),
         *("preprocess", "constants", "notes"),
@@ -169,7 +170,9 @@ def hybrid(*companions: TensorSpec) -> PolicySignature:
         TensorSpec("continuous_actions", Role.CONTINUOUS, "float32", (None, 2)),
         TensorSpec("discrete_actions", Role.LOG_PROBS, "float32", (None, 5)),
     )
-    return PolicySignature((), (*heads, *companions), "own model", "hybrid", (2, 3))
+    return PolicySignature(
+        inputs=(), outputs=(*heads, *companions), family="own model", action_space="hybrid", branches=(2, 3)
+    )
 
 
 def test_each_action_of_a_hybrid_has_its_own_companion_even_where_one_is_missing() -> None:
@@ -192,7 +195,14 @@ def test_the_only_action_has_the_companion_that_there_is() -> None:
     action = TensorSpec("action", Role.SAMPLED, "int64", (None, 1))
     likeliest = TensorSpec("own/deterministic", Role.DETERMINISTIC, "int64", (None, 1))
     scores = TensorSpec("action_log_probs", Role.LOG_PROBS, "float32", (None, 4))
-    signature = PolicySignature((), (action, likeliest, scores), "own model", "discrete", (4,))
+    signature = PolicySignature(
+        inputs=(), outputs=(action, likeliest, scores), family="own model", action_space="discrete", branches=(4,)
+    )
     assert signature.companion_of("action") is likeliest
     assert signature.log_probs is scores
-    assert PolicySignature((), (likeliest,), "own model", "discrete", (4,)).heads[0].plain is None
+    assert (
+        PolicySignature(inputs=(), outputs=(likeliest,), family="own model", action_space="discrete", branches=(4,))
+        .heads[0]
+        .plain
+        is None
+    )

@@ -100,7 +100,7 @@ def _behind(graph: Graph, tensor: str, steps: Sequence[_Step]) -> Graph:
 
 
 def _signature(signature: PolicySignature, interface: Interface, notes: Sequence[str]) -> PolicySignature:
-    raw = [Term(q.name, q.source, clip=q.clip) for q in interface.limits if q.name == RAW_ACTION]
+    raw = [Term(name=q.name, source=q.source, clip=q.clip) for q in interface.limits if q.name == RAW_ACTION]
     stripped = tuple(replace(t, scale=(), offset=(), clip=()) for t in interface.actions)
     moved = replace(
         interface,

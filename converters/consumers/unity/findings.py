@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Any
 
-from msgspec import Struct
+from signatures.fields import Record
 
 
 class Severity(StrEnum):
@@ -16,7 +15,7 @@ class Severity(StrEnum):
     INFO = "info"
 
 
-class Finding(Struct, frozen=True):
+class Finding(Record, frozen=True):
     """One thing that is wrong: ``message`` in Unity's words where Unity says it, ``where`` it lies, how to mend it."""
 
     severity: Severity
@@ -24,17 +23,13 @@ class Finding(Struct, frozen=True):
     where: str
     fix: str
 
-    def to_dict(self) -> dict[str, Any]:
-        """For ``--json``."""
-        return {"severity": self.severity.value, "message": self.message, "where": self.where, "fix": self.fix}
-
 
 def warning(message: str, where: str, fix: str) -> Finding:
     """What does not end anything."""
     return Finding(Severity.WARNING, message, where, fix)
 
 
-class Thrown(Struct, frozen=True):
+class Thrown(Record, frozen=True, omit_defaults=False, rename={"worded": "worded_by_unity"}):
     """An exception of Unity's: its C# class, its message, what in the file it comes from, how to mend it.
 
     ``worded`` is false where Unity's own words are not known; ``message`` then says what happens.
@@ -45,16 +40,6 @@ class Thrown(Struct, frozen=True):
     where: str
     fix: str
     worded: bool = True
-
-    def to_dict(self) -> dict[str, Any]:
-        """For ``--json``."""
-        return {
-            "exception": self.exception,
-            "message": self.message,
-            "where": self.where,
-            "fix": self.fix,
-            "worded_by_unity": self.worded,
-        }
 
 
 class UnityThrows(Exception):  # noqa: N818 (it is no error of this project)

@@ -8,10 +8,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from msgspec import Struct, field
+from msgspec import field
 
 from converters.files.fetch import read_bytes
 from signatures.errors import UsageError
+from signatures.fields import Record
 
 #: Class of a sensor by the number of its axes, where nobody names it.
 _CLASSES = {1: "VectorSensor", 2: "BufferSensor", 3: "CameraSensor"}
@@ -20,7 +21,7 @@ _MOST, _MOST_BYTES = 1024, 1 << 20
 _ACTIONS = "continuous:2, discrete:3,2 or continuous:2+discrete:3"
 
 
-class Sensor(Struct, frozen=True):
+class Sensor(Record, frozen=True, rename={"kind": "type"}):
     """One sensor: its C# class and name, which stand in messages, and its shape.
 
     ``shape`` is [n] (a vector), [a, b] (a BufferSensor: at most a entities of b numbers) or [C, H, W] (a camera).
@@ -37,12 +38,8 @@ class Sensor(Struct, frozen=True):
         name = f"VectorSensor_size{shape[0]}" if len(shape) == 1 else kind
         return cls(kind, name if len(shape) == 1 or not number else f"{name}{number}", tuple(shape))
 
-    def to_dict(self) -> dict[str, Any]:
-        """For ``--json``; also what ``read_brain`` reads."""
-        return {"type": self.kind, "name": self.name, "shape": list(self.shape)}
 
-
-class Brain(Struct, frozen=True):
+class Brain(Record, frozen=True, omit_defaults=False):
     """What Behavior Parameters say (Space Size, Stacked Vectors, Continuous Actions, Branch Sizes), and the sensors."""
 
     continuous: int = 0
@@ -50,16 +47,6 @@ class Brain(Struct, frozen=True):
     vector_observation_size: int = 0
     stacked: int = 1
     sensors: tuple[Sensor, ...] = field(default_factory=tuple)
-
-    def to_dict(self) -> dict[str, Any]:
-        """For ``--json``; also what ``read_brain`` reads."""
-        return {
-            "continuous": self.continuous,
-            "branches": list(self.branches),
-            "vector_observation_size": self.vector_observation_size,
-            "stacked": self.stacked,
-            "sensors": [s.to_dict() for s in self.sensors],
-        }
 
     @classmethod
     def from_dict(cls, entry: Mapping[str, Any]) -> Brain:

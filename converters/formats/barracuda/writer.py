@@ -30,7 +30,7 @@ from converters.formats.format import WriteOptions
 from converters.policy.policy import Policy
 from signatures.contract import EMBEDDED, json_of, parse_signature
 from signatures.errors import DamagedFileError
-from signatures.fields import Field, FieldError
+from signatures.fields import FieldError
 from signatures.spec import PolicySignature
 
 #: What Barracuda has for a model that no file was imported for.
@@ -52,7 +52,7 @@ def embedded_contract(path: Path) -> str:
 def contract_of(model: NnModel) -> PolicySignature:
     """The contract that the writer left in the file. Raises DamagedFileError where there is none."""
     try:
-        return parse_signature(Field(json_of(model.metadata(EMBEDDED) or "")))
+        return parse_signature(json_of(model.metadata(EMBEDDED) or ""))
     except FieldError as error:
         raise DamagedFileError(
             "the .nn carries no contract of export-model",

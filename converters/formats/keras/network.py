@@ -16,9 +16,9 @@ from converters.formats.saved_model.signature import ModelSignature, Tensor
 from converters.graph.builder import Builder
 from converters.graph.nodes import MAX_NAME, NameScope, Node, TensorShape
 from converters.graph.types import FLOAT32
-from signatures.contract import DTYPES
 from signatures.errors import DamagedFileError, NotAPolicyError, UnsupportedOpError
 from signatures.memories import SeparateMemory
+from signatures.spec import DTYPES
 
 Results = dict[tuple[str, int], list[str]]
 _RECURRENT = frozenset(("LSTM", "GRU", "SimpleRNN", "RNN"))
