@@ -164,23 +164,22 @@ class Match:
         yield from ()
 
     def _beside_reference(self, actor: LoadedPolicy, participant: Participant) -> Played:
-        """Return what came of the episodes. Where they do not decide, as many others are played as would, if no more
-        than ``most``; those are judged by themselves, so that a player at the margin passes one in forty times in each.
-        """
-        assert self.reference is not None
-        options, name, runtime = self._options, participant.name, participant.runtime
-        who, own = f"{name} in {runtime}", self.reference
-        episodes = self._episodes(actor, who)
-        compared = equivalence(own.returns, episodes.returns, self.margin)
-        doubled = (options.episodes << k for k in range(1, 21))
-        more = next((n for n in doubled if n >= (compared.needed or n + 1)), None)
-        if compared.needed is None or more is None or more > options.most:
-            return Played(name, runtime, episodes, compared, own)
-        if more not in self._more:
-            assert self._actor_of_reference is not None
-            self._more[more] = self._episodes(self._actor_of_reference, f"the reference, {self.reference_name}", more)
-        own, episodes = self._more[more], self._episodes(actor, who, more)
-        return Played(name, runtime, episodes, equivalence(own.returns, episodes.returns, self.margin), own)
+        """Return what came of the episodes, those that the reference plays beside them kept for the next."""
+        name, runtime = participant.name, participant.runtime
+        who = f"{name} in {runtime}"
+
+        def reference(more: int) -> Episodes:
+            if not more:
+                assert self.reference is not None
+                return self.reference
+            if more not in self._more:
+                assert self._actor_of_reference is not None
+                said = f"the reference, {self.reference_name}"
+                self._more[more] = self._episodes(self._actor_of_reference, said, more)
+            return self._more[more]
+
+        decided = decide(reference, lambda more: self._episodes(actor, who, more), self._options, self.margin)
+        return Played(name, runtime, *decided)
 
     def _actor(self, run: Run, runtime: str, signature: PolicySignature | None = None) -> LoadedPolicy:
         assert self.policy is not None
@@ -209,11 +208,35 @@ class Match:
             self._world,
             actor,
             more or options.episodes,
-            turn_seed(options.seed, _MORE) if more else options.seed,
+            seed_of(options.seed, more),
             deterministic=options.deterministic,
             watch=watch,
             advance=advance,
         )
+
+
+def seed_of(seed: int, more: int) -> int:
+    """Return the seed of the first episodes (``more`` 0), or of others."""
+    return turn_seed(seed, _MORE) if more else seed
+
+
+def decide(
+    reference: Callable[[int], Episodes], candidate: Callable[[int], Episodes], options: PlayOptions, margin: float
+) -> tuple[Episodes, Equivalence, Episodes]:
+    """Return the candidate's episodes, the verdict on them, and the reference's that begin like these.
+
+    Both play the first episodes when called with 0. Where those do not decide, as many others are played as would, if
+    no more than ``most``; these are judged by themselves, so that a player at the margin passes one in forty times in
+    each.
+    """
+    own, episodes = reference(0), candidate(0)
+    compared = equivalence(own.returns, episodes.returns, margin)
+    doubled = (options.episodes << k for k in range(1, 21))
+    more = next((n for n in doubled if n >= (compared.needed or n + 1)), None)
+    if compared.needed is None or more is None or more > options.most:
+        return episodes, compared, own
+    own, episodes = reference(more), candidate(more)
+    return episodes, equivalence(own.returns, episodes.returns, margin), own
 
 
 def _run_of(reference: Reference) -> Run:

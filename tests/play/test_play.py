@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -263,3 +266,14 @@ def test_the_public_module_plays(bundles: Path) -> None:
     assert report.passed is True
     assert json.loads(json.dumps(report.to_dict()))["margin"]["asked"] == "2%"
     assert "EQUIVALENT" in repr(report)
+
+
+@pytest.mark.parametrize(("said", "threads"), [(None, "1"), ("3", "3")])
+def test_numpy_takes_one_thread_where_the_command_plays(said: str | None, threads: str, tmp_path: Path) -> None:
+    """In a process of its own: the user's environment module says what it finds."""
+    (tmp_path / "says.py").write_text("import os\nraise SystemExit(os.environ.get('OPENBLAS_NUM_THREADS'))\n")
+    own = {k: v for k, v in os.environ.items() if k != "OPENBLAS_NUM_THREADS"}
+    own |= {} if said is None else {"OPENBLAS_NUM_THREADS": said}
+    command = (sys.executable, "-m", "exporter", "play", fixture("continuous"), "--env", "says:make")
+    ran = subprocess.run(command, cwd=tmp_path, env=own, capture_output=True, text=True, check=False)
+    assert threads in ran.stderr.splitlines(), ran.stderr
