@@ -38,7 +38,7 @@ UNITS: tuple[tuple[float, str], ...] = (
 )
 #: Bounds that robots' code clips observations to.
 CLIPS = (1.0, 3.0, 5.0, 10.0, 18.0, 100.0)
-#: ML-Agents clips what it normalised to this.
+#: What ML-Agents, rl_games and skrl clip what they normalised to.
 NORMALISED_CLIP = 5.0
 #: Columns of a drawn action whose pairs are tried.
 MOST_DRAWN_ACTIONS = 24
@@ -163,13 +163,14 @@ def _normaliser(signature: PolicySignature, recording: Recording) -> Iterator[Ca
         mean, std = (np.broadcast_to(np.asarray(given[k], logged.dtype), logged.shape[1:]) for k in ("mean", "std"))
 
         twice = "the policy was given values that were normalised already: the normaliser was applied twice"
-        yield Cause("normaliser", spec.name, twice, on(spec.name, _normalise(mean, std)))
+        bound = float(given.get("clip", NORMALISED_CLIP))
+        yield Cause("normaliser", spec.name, twice, on(spec.name, _normalise(mean, std, bound)))
         missing = "the log has normalised values, or the normaliser was left out: the policy takes raw ones"
         yield Cause("normaliser", spec.name, missing, on(spec.name, _raw(mean, std)))
 
 
-def _normalise(mean: Array, std: Array) -> Callable[[Array], Array]:
-    return lambda array: ((array - mean) / std).clip(-NORMALISED_CLIP, NORMALISED_CLIP)
+def _normalise(mean: Array, std: Array, bound: float) -> Callable[[Array], Array]:
+    return lambda array: ((array - mean) / std).clip(-bound, bound)
 
 
 def _raw(mean: Array, std: Array) -> Callable[[Array], Array]:
@@ -184,17 +185,23 @@ def _stated_scales(signature: PolicySignature, recording: Recording) -> Iterator
         widths = [term.width for term in terms]
         if None in widths or sum(w or 0 for w in widths) != logged.shape[1]:
             continue
-        first = 0
+        first, stated = 0, []
         for term, width in zip(terms, widths, strict=True):
             last = first + (width or 0)
             scale = np.resize(np.asarray(term.scale or (1.0,), logged.dtype), last - first)
-            where = f"{spec.name}[{first}…{last - 1}]"
             if (scale != 1).any() and scale.all():
-                twice = f"the scale of {term.name} ({term.source}) was applied twice"
-                yield Cause("stated_scale", where, twice, on(spec.name, _scale_columns(first, last, scale)))
-                missing = f"the scale of {term.name} ({term.source}) was not applied"
-                yield Cause("stated_scale", where, missing, on(spec.name, _scale_columns(first, last, 1 / scale)))
+                stated.append((f"the scale of {term.name} ({term.source}) was", first, last, scale))
             first = last
+        if len(stated) > 1:
+            every = np.ones(logged.shape[1], logged.dtype)
+            for _, a, b, scale in stated:
+                every[a:b] = scale
+            stated.insert(0, (f"the scales of {len(stated)} terms were", 0, len(every), every))
+        for says, a, b, scale in stated:
+            where = f"{spec.name}[{a}…{b - 1}]"
+            twice, missing = (on(spec.name, _scale_columns(a, b, factors)) for factors in (scale, 1 / scale))
+            yield Cause("stated_scale", where, f"{says} applied twice", twice)
+            yield Cause("stated_scale", where, f"{says} not applied", missing)
 
 
 def _scale_columns(first: int, last: int, factors: Array) -> Callable[[Array], Array]:
