@@ -8,7 +8,7 @@ those scripts, the activation too, which is said in a note: people change it.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from msgspec import Struct
@@ -20,7 +20,7 @@ from converters.graph.nodes import Graph
 from converters.policy.facts import SourceFacts
 from converters.trainers.pytorch.activations import activation_of
 from converters.trainers.pytorch.network import Network
-from converters.trainers.pytorch.weights import TensorFile, Weights, pytorch_alone
+from converters.trainers.pytorch.weights import Weights, pytorch_alone
 from converters.trainers.rsl_rl import per_action
 from converters.trainers.trainer import Rebuilt, Saved, Trainer
 from signatures.errors import SourceError, UsageError
@@ -59,7 +59,7 @@ class _Script(Struct, frozen=True):
 class _Making(Struct):
     net: Network
     activation: Activation
-    told: Sequence[tuple[int, ...]]
+    saved: Saved
     outputs: _Outputs
     notes: list[str]
     memory: tuple[str, ...] = ()
@@ -80,19 +80,12 @@ def _state_of(value: Any) -> tuple[Mapping[Any, Any], _Script] | None:
 
 
 def _to_graph(
-    archive: TensorFile,
-    state: Mapping[Any, Any],
-    script: _Script,
-    activation: Activation,
-    told: Sequence[tuple[int, ...]],
+    saved: Saved, state: Mapping[Any, Any], script: _Script, activation: Activation
 ) -> tuple[Graph, SourceFacts]:
-    """The policy and what is known of it; ``told`` says the image's shape, where there is one.
-
-    Raises SourceError for parts that are not known, DamagedFileError, UsageError.
-    """
-    weights = Weights(archive, state, holder="its policy", maker="CleanRL", fix=_EXPORT_ONNX)
+    """The policy and what is known of it. Raises SourceError for unknown parts, DamagedFileError, UsageError."""
+    weights = Weights(saved.archive, state, holder="its policy", maker="CleanRL", fix=_EXPORT_ONNX)
     weights.forget("critic", "_critic")
-    making = _Making(Network(weights), activation, told, {}, [])
+    making = _Making(Network(weights), activation, saved, {}, [])
     meaning = script.build(making)
     weights.check_all_read()
     facts = SourceFacts(
@@ -119,22 +112,12 @@ def _observation_input(making: _Making, first: str) -> str:
     net = making.net
     shape = net.state.shape(f"{first}.weight")
     if len(shape) in (1, 2):
-        if making.told and tuple(making.told) != ((shape[-1],),):
+        if making.saved.sensors and tuple(making.saved.sensors) != ((shape[-1],),):
             raise UsageError(
                 "--sensors does not fit the checkpoint", why=f"it observes {shape[-1]} numbers", fix="leave it out"
             )
         return net.input("obs", shape[-1])
-    if len(making.told) != 1 or len(making.told[0]) != 3:
-        raise SourceError(
-            "the checkpoint does not tell the size of the image that it sees",
-            why="convolutions take any",
-            fix="say it: --sensors 4x84x84 (channels, height, width; CleanRL stacks four grey frames)",
-        )
-    (size,) = making.told
-    if len(shape) != 4 or size[0] != shape[1]:
-        raise UsageError(
-            "--sensors does not fit the checkpoint", why=f"its image has {shape[1]} channels", fix="say them"
-        )
+    size = making.saved.image_shape(net.state.length(f"{first}.weight", 1), "; CleanRL stacks four grey frames")
     making.notes.append("its image has colours from 0 to 255, which CleanRL's scripts divide by 255")
     image = net.input("obs", *size)
     net.at("obs_scaled")
@@ -331,7 +314,7 @@ _SCRIPTS = (
 def _rebuild(saved: Saved, found: tuple[Mapping[Any, Any], _Script]) -> Rebuilt:
     state, script = found
     activation, files, notes = activation_of(saved.given, saved.activation, _USUAL, script.default)
-    graph, facts = _to_graph(saved.archive, state, script, activation, saved.sensors)
+    graph, facts = _to_graph(saved, state, script, activation)
     return Rebuilt(graph, replace(facts, notes=(*facts.notes, *notes)), files)
 
 

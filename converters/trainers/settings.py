@@ -13,6 +13,7 @@ from converters.files.file_probe import json_in
 from converters.files.yaml_data import MAX_YAML_BYTES, read_yaml
 from converters.graph.nn.activations import Activation
 from converters.trainers.pytorch.activations import activation_named
+from converters.trainers.trainer import Saved
 from signatures.errors import SourceError
 
 #: Folders of a run that hold its checkpoints alone: the settings lie one folder up.
@@ -122,6 +123,25 @@ def _json_values(data: bytes, name: str) -> Any:
         raise SourceError(
             f"{name} is not JSON", why=str(error)[:200], fix="give the file that the training wrote"
         ) from error
+
+
+def needed_settings(
+    saved: Saved, trainer: str, names: Sequence[str], keys: Sequence[str], *, why: str, fix: str
+) -> tuple[Settings, Path]:
+    """Return what ``find_settings`` finds. Raises UsageError where activations are given, which the file has.
+
+    Raises SourceError where there is no such file: ``why`` says what it holds, ``fix`` where the trainer leaves it.
+    """
+    saved.refuse_activation(f"a checkpoint of {trainer}", "its agent.yaml has each of them")
+    found = find_settings(saved.given, names, keys)
+    if found is None:
+        files = ", ".join(names)
+        raise SourceError(
+            "its agent.yaml is missing",
+            why=f"a checkpoint of {trainer} has weights; {why}, and none of these files is here: {files}",
+            fix=fix,
+        )
+    return found
 
 
 def find_settings(given: Fetched, names: Sequence[str], keys: Sequence[str]) -> tuple[Settings, Path] | None:

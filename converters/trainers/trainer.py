@@ -15,7 +15,7 @@ from converters.files.fetch import Fetched
 from converters.graph.nodes import Graph
 from converters.policy.facts import SourceFacts
 from converters.trainers.pytorch.weights import TensorFile
-from signatures.errors import UsageError
+from signatures.errors import SourceError, UsageError
 
 
 class Saved(Struct, frozen=True):
@@ -44,6 +44,24 @@ class Saved(Struct, frozen=True):
         """Raise UsageError where ``--activation`` is given to a trainer whose networks have one of their own."""
         if self.activation is not None:
             raise UsageError(f"--activation says nothing about {maker}", why=why, fix="leave it out")
+
+    def image_shape(self, channels: int, channels_are: str = "") -> tuple[int, int, int]:
+        """Return the shape of the one image that convolutions of so many channels see, [C, H, W], which the user says.
+
+        ``channels_are`` says what a trainer stacks there. Raises SourceError, UsageError.
+        """
+        if len(self.sensors) != 1 or len(self.sensors[0]) != 3:
+            raise SourceError(
+                "the checkpoint does not tell the size of the image that it sees",
+                why="convolutions take any",
+                fix=f"say it: --sensors {channels}x84x84 (channels, height, width{channels_are})",
+            )
+        ((found, height, width),) = self.sensors
+        if found != channels:
+            raise UsageError(
+                "--sensors does not fit the checkpoint", why=f"its image has {channels} channels", fix="say them"
+            )
+        return channels, height, width
 
 
 class Rebuilt(Struct, frozen=True):

@@ -142,7 +142,7 @@ def test_what_the_weights_do_not_tell_is_refused_and_named(tmp_path: Path) -> No
         assert words in str(caught.value), name
     with pytest.raises(SourceError, match="the size of the image") as caught:
         read_source(saved(tmp_path, "clean_dqn_atari"), ReadOptions(activation="relu"))
-    assert "--sensors 4x84x84" in str(caught.value)
+    assert "--sensors 2x84x84" in str(caught.value)
     writer = Writer()
     state = writer.state({"mlp_extractor.policy_net.0.weight": weight, "action_net.weight": weight})
     (tmp_path / "policy.pth").write_bytes(writer.zip(state))

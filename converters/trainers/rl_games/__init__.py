@@ -10,9 +10,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from converters.trainers.rl_games.policy import rebuild_actor_critic, rebuild_soft_actor
-from converters.trainers.settings import find_settings
+from converters.trainers.settings import needed_settings
 from converters.trainers.trainer import Rebuilt, Saved, Trainer
-from signatures.errors import SourceError
 
 #: Where a run keeps its settings: Isaac Lab, rl_games itself, IsaacGymEnvs (below ``train``).
 _FILES = ("params/agent.yaml", "agent.yaml", "config.yaml")
@@ -43,17 +42,15 @@ def _without_compiled(state: Any) -> dict[str, Any]:
 
 
 def _rebuild(saved: Saved, states: dict[str, Mapping[Any, Any]]) -> Rebuilt:
-    saved.refuse_activation("a checkpoint of rl_games", "its agent.yaml has each of them")
-    found = find_settings(saved.given, _FILES, _KEYS)
-    if found is None:
-        raise SourceError(
-            "its agent.yaml is missing",
-            why="a checkpoint of rl_games has weights; which activations, memory and deviation they belong to stands "
-            "in the settings of its run, and none of these files is here: " + ", ".join(_FILES),
-            fix="put the run's params/agent.yaml (Isaac Lab) or config.yaml next to the checkpoint, or give the .pth "
-            "where the run left it",
-        )
-    settings, file = found
+    settings, file = needed_settings(
+        saved,
+        "rl_games",
+        _FILES,
+        _KEYS,
+        why="which activations, memory and deviation they belong to stands in the settings of its run",
+        fix="put the run's params/agent.yaml (Isaac Lab) or config.yaml next to the checkpoint, or give the .pth "
+        "where the run left it",
+    )
     params = settings.section("train") if "train" in settings else settings
     params = params.section("params")
     build = rebuild_actor_critic if "model" in states else rebuild_soft_actor

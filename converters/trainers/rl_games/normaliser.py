@@ -11,7 +11,6 @@ from converters.graph.types import FLOAT32
 from converters.trainers.pytorch.network import Network
 from converters.trainers.pytorch.weights import Weights
 from converters.trainers.trainer import Saved
-from signatures.errors import SourceError, UsageError
 
 _EPSILON = np.float32(1e-5)
 _LIMIT = 5
@@ -31,17 +30,7 @@ def observed_shape(weights: Weights, normaliser: str, saved: Saved, layer: str) 
     shape = weights.shape(layer)
     if len(shape) != 4:
         return (weights.length(layer, 1),)
-    if len(saved.sensors) != 1 or len(saved.sensors[0]) != 3:
-        raise SourceError(
-            "the checkpoint does not tell the size of the image that it sees",
-            why="convolutions take any",
-            fix=f"say it: --sensors {shape[1]}x84x84 (channels, height, width)",
-        )
-    ((channels, height, width),) = saved.sensors
-    if channels != shape[1]:
-        raise UsageError(
-            "--sensors does not fit the checkpoint", why=f"its image has {shape[1]} channels", fix="say them"
-        )
+    channels, height, width = saved.image_shape(shape[1])
     return height, width, channels
 
 

@@ -9,10 +9,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from converters.trainers.settings import find_settings
+from converters.trainers.settings import needed_settings
 from converters.trainers.skrl.policy import PREPROCESSORS, rebuild_policy
 from converters.trainers.trainer import Rebuilt, Saved, Trainer
-from signatures.errors import SourceError
 
 _FILES = ("params/agent.yaml", "agent.yaml")
 
@@ -29,17 +28,15 @@ def _policy_of(saved: Saved) -> dict[Any, Any] | None:
 
 
 def _rebuild(saved: Saved, state: dict[Any, Any]) -> Rebuilt:
-    saved.refuse_activation("a checkpoint of skrl", "its agent.yaml has each of them")
-    found = find_settings(saved.given, _FILES, ("models",))
-    if found is None:
-        raise SourceError(
-            "its agent.yaml is missing",
-            why="a checkpoint of skrl has weights; which layers and activations they belong to stands in the settings "
-            "of its run (models), and none of these files is here: " + ", ".join(_FILES),
-            fix="put the run's params/agent.yaml next to the checkpoint; a model that is a class of its own "
-            "is exported there (torch.onnx.export), and the .onnx given",
-        )
-    settings, file = found
+    settings, file = needed_settings(
+        saved,
+        "skrl",
+        _FILES,
+        ("models",),
+        why="which layers and activations they belong to stands in the settings of its run (models)",
+        fix="put the run's params/agent.yaml next to the checkpoint; a model that is a class of its own "
+        "is exported there (torch.onnx.export), and the .onnx given",
+    )
     graph, facts = rebuild_policy(saved, state, settings)
     return Rebuilt(graph, facts, (file,))
 

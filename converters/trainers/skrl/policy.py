@@ -26,7 +26,7 @@ from converters.trainers.rsl_rl import per_action
 from converters.trainers.settings import MAX_UNITS, Settings
 from converters.trainers.skrl.expressions import evaluate
 from converters.trainers.trainer import Saved
-from signatures.errors import DamagedFileError, SourceError, UsageError
+from signatures.errors import DamagedFileError
 from signatures.roles import Role
 
 EXPORT_ONNX = "load it in skrl, export the policy (torch.onnx.export, its preprocessor included), and give the .onnx"
@@ -116,7 +116,10 @@ def _observe(made: _Making, saved: Saved, *, normalised: bool) -> str:
     rank = len(weights.shape(first))
     shape: tuple[int, ...]
     if rank == 4:
-        shape = _image_shape(made, saved, weights.length(first, 1))
+        channels, height, width = saved.image_shape(weights.length(first, 1))
+        shape = (channels, height, width)
+        if "permute" in _first_input(made.model):
+            shape = (height, width, channels)
     elif normalised:
         shape = weights.shape(f"{PREPROCESSORS[0]}.running_mean")
     else:
@@ -126,21 +129,6 @@ def _observe(made: _Making, saved: Saved, *, normalised: bool) -> str:
         x = _normalise(net, x, shape)
     channels_first = rank == 4 and "permute" not in _first_input(made.model)
     return net.nhwc(x) if channels_first else x
-
-
-def _image_shape(made: _Making, saved: Saved, channels: int) -> tuple[int, ...]:
-    if len(saved.sensors) != 1 or len(saved.sensors[0]) != 3:
-        raise SourceError(
-            "the checkpoint does not tell the size of the image that it sees",
-            why="convolutions take any",
-            fix=f"say it: --sensors {channels}x84x84 (channels, height, width)",
-        )
-    (size,) = saved.sensors
-    if size[0] != channels:
-        raise UsageError(
-            "--sensors does not fit the checkpoint", why=f"its image has {channels} channels", fix="say them"
-        )
-    return (size[1], size[2], size[0]) if "permute" in _first_input(made.model) else size
 
 
 def _first_input(model: Settings) -> str:
