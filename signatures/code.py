@@ -9,6 +9,8 @@ from typing import Any
 from signatures.errors import UsageError
 from signatures.fields import Record
 
+#: What the file of a policy's weights is called that lies beside its source code.
+WEIGHTS_FILE = "{name}.weights.bin"
 #: Option → what it may say, the usual one first.
 CHOICES: Mapping[str, tuple[str, ...]] = {
     "math": ("library", "own"),

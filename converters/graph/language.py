@@ -10,6 +10,7 @@ import numpy as np
 
 from converters.graph.ops.loops.base import Applied, Number
 from converters.graph.ops.loops.own_math import OWN
+from converters.graph.program import Place
 from converters.graph.types import FLOAT32
 
 _WORDS = re.compile(r"[^0-9A-Za-z]+")
@@ -41,12 +42,6 @@ def comment(text: str) -> str:
     return f"/* {safe} */"
 
 
-def numbers(value: np.ndarray, one: str = "{}f") -> list[str]:
-    """The finite float32 elements of an array as text that reads back to the same bits; ``one`` is around each."""
-    words = (f"{x:.9g}" for x in value.reshape(-1).tolist())
-    return [one.format(w if "." in w or "e" in w else f"{w}.0") for w in words]
-
-
 def lines_of(words: Sequence[str]) -> str:
     """Numbers of an array, twelve on a line."""
     rows = (", ".join(words[i : i + _PER_LINE]) for i in range(0, len(words), _PER_LINE))
@@ -64,6 +59,8 @@ class Language(ABC):
     terms = 1
     #: Whether constants are read in blocks (``converters.graph.blocks``).
     blocks = False
+    #: How a finite float32 stands in an array, where its type is said before.
+    element = "{}f"
 
     def __init__(self, own: bool = False) -> None:
         self.helpers: dict[str, str] = {}
@@ -112,6 +109,17 @@ class Language(ABC):
     def round_to(self, text: str, x: Applied) -> str:
         """What an operator gives, in the precision of its dtype."""
         return text
+
+    def elements(self, place: Place) -> list[str]:
+        """A constant's numbers as the initialiser of an array lists them; halves by their 16 bits."""
+        assert place.value is not None
+        value = place.value.reshape(-1)
+        if value.dtype in (np.int8, np.float16):
+            return [str(x) for x in (value if value.dtype == np.int8 else value.view(np.uint16)).tolist()]
+        if value.dtype == FLOAT32 and np.isfinite(value).all():
+            words = (f"{x:.9g}" for x in value.tolist())  # reads back to the same bits
+            return [self.element.format(w if "." in w or "e" in w else f"{w}.0") for w in words]
+        return [self.literal(x, value.dtype) for x in value.tolist()]
 
     def applied(self, x: Applied, operands: Sequence[str]) -> str:
         """A function of operands."""

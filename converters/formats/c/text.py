@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from converters.graph.language import Language, bare, lines_of, numbers
+from converters.graph.language import Language, bare, lines_of
 from converters.graph.program import Place
 from converters.graph.types import FLOAT32, INT64
 
@@ -124,12 +124,6 @@ class C(Language):
 
     def constant(self, place: Place, name: str) -> str:
         """The definition of a constant."""
-        assert place.value is not None
-        value = place.value.reshape(-1)
-        plain = place.dtype == FLOAT32 and np.isfinite(value).all()
-        if place.dtype.name in ("int8", "float16"):
-            words = [str(x) for x in (value if value.dtype == np.int8 else value.view(np.uint16)).tolist()]
-        else:
-            words = numbers(value) if plain else [self.literal(x, place.dtype) for x in value.tolist()]
+        words = self.elements(place)
         kind = C_TYPES[place.dtype.name]
         return f"static const {kind} {name}[{max(1, place.size)}] = {{\n    {lines_of(words)}\n}};"

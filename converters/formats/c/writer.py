@@ -19,7 +19,7 @@ from converters.formats.c.extras import (
 from converters.formats.c.text import C_TYPES, C
 from converters.formats.format import WriteOptions
 from converters.formats.programs.members import Field
-from converters.formats.programs.plan import CLOSE, ROWS, Plan, formula, plan_of
+from converters.formats.programs.plan import CLOSE, ROWS, Plan, formula, write_program
 from converters.formats.programs.weights import weights_name, widen_where_used
 from converters.graph.ops.loops.layers import box_muller, gumbel
 from converters.graph.printer import Printer
@@ -65,9 +65,7 @@ _STRICT = """
 
 def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
     """The header. Raises UnsupportedOpError."""
-    plan = plan_of(policy, options)
-    file = {} if plan.weights.file is None else {weights_name(policy.name): Pieces(plan.weights.file)}
-    return {f"{policy.name}.h": Pieces(_text(policy.name, plan).encode("ascii")), **file}
+    return write_program(policy, options, ".h", _text)
 
 
 def _text(name: str, plan: Plan) -> str:
@@ -76,7 +74,7 @@ def _text(name: str, plan: Plan) -> str:
     words = C(p, plan.code.math == "own")
     printer = Printer(words, f"{p}_w_")
     by_name = {f.spec.name: f"input->{f.name}" for f in header.inputs}
-    by_name |= {f.spec.name: f"memory->{f.name}" for f in header.fed if f not in header.inputs}
+    by_name |= {f.spec.name: f"memory->{f.name}" for f in header.kept}
     for key, tensor in program.inputs.items():
         printer.called(tensor.place, by_name[key])
     body = _compute_lines(plan, printer)
@@ -108,7 +106,7 @@ def _compute_lines(plan: Plan, printer: Printer) -> list[str]:
 def _declarations(name: str, plan: Plan, choose: str) -> list[str]:
     """What a program that includes the header sees: structures and functions, with what they do."""
     header, program = plan.header, plan.program
-    p, state, sizes, loads = header.prefix, header.state, plan.sizes, plan.weights.file is not None
+    p, sizes, loads = header.prefix, plan.sizes, plan.weights.file is not None
     return [
         f"/* {p}: a policy without a runtime. In one source file, write\n"
         f"       #define {p.upper()}_IMPLEMENTATION\n"
@@ -125,8 +123,7 @@ def _declarations(name: str, plan: Plan, choose: str) -> list[str]:
             [
                 *(["const unsigned char *weights;"] if loads else []),
                 "uint64_t stream;",
-                *map(_member, header.noise),
-                *([_member(state)] if state else []),
+                *map(_member, header.kept),
                 *(
                     f"{c} {arena}[{size}];"
                     for arena, size in program.arenas.items()
@@ -158,7 +155,7 @@ def _definitions(plan: Plan, printer: Printer, words: C, body: Sequence[str], ch
     header = plan.header
     p, loads = header.prefix, plan.weights.file is not None
     normal = printer.function(box_muller, "radius", "turn") if header.noise else ""
-    draws = printer.draws or bool(header.noise) or bool(choose)
+    draws = plan.draws(printer)
     return [
         f"#ifdef __cplusplus\n}}\n#endif\n\n#endif\n\n"
         f"#ifdef {p.upper()}_IMPLEMENTATION\n#include <float.h>\n#include <math.h>\n#include <string.h>",
@@ -211,8 +208,7 @@ def _struct(name: str, about: str, members: Iterable[str]) -> str:
 
 
 def _member(field: Field) -> str:
-    shape = " x ".join(str(n) for n in (field.spec.shape[1:] if field.spec.batched else field.spec.shape))
-    return f"{C_TYPES[field.spec.dtype]} {field.name}[{field.size}]; /* {field.spec.role.value}, {shape or '1'} */"
+    return f"{C_TYPES[field.spec.dtype]} {field.name}[{field.size}]; /* {field.about} */"
 
 
 def _selftest(plan: Plan, words: C) -> str:

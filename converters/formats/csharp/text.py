@@ -8,9 +8,8 @@ import numpy as np
 
 from converters.formats.programs.weights import Kept
 from converters.graph.blocks import LANES, TERMS, Packed
-from converters.graph.language import Language, bare, lines_of, numbers
+from converters.graph.language import Language, bare, lines_of
 from converters.graph.ops.loops.base import Applied
-from converters.graph.program import Place
 from converters.graph.types import BOOL, FLOAT32, INT32, INT64
 
 #: What C# calls a dtype.
@@ -217,7 +216,7 @@ class CSharp(Language):
             ]
         else:
             pairs = zip(kinds, parts, strict=True)
-            arrays = [f"new {kind}[] {{\n    {lines_of(self._words(p))},\n}}" for kind, p in pairs]
+            arrays = [f"new {kind}[] {{\n    {lines_of(self.elements(p))},\n}}" for kind, p in pairs]
         if kept.step is not None:
             self.helpers["_Widen"] = _WIDEN
             return f"_Widen({', '.join(arrays)}, {kept.inner})"
@@ -225,14 +224,3 @@ class CSharp(Language):
             self.helpers["_Half"] = _HALF
             return f"_Half({arrays[0]})"
         return arrays[0]
-
-    def _words(self, place: Place) -> list[str]:
-        assert place.value is not None
-        value = place.value.reshape(-1)
-        if place.dtype == np.float16:
-            return [str(x) for x in value.view(np.uint16).tolist()]
-        if place.dtype == np.int8:
-            return [str(x) for x in value.tolist()]
-        if place.dtype == FLOAT32 and np.isfinite(value).all():
-            return numbers(value)
-        return [self.literal(x, place.dtype) for x in value.tolist()]

@@ -11,7 +11,7 @@ from converters.files.chunks import Pieces
 from converters.formats.csharp.text import CS_TYPES, CSharp
 from converters.formats.format import WriteOptions
 from converters.formats.programs.members import Field
-from converters.formats.programs.plan import CLOSE, ROWS, Plan, formula, plan_of
+from converters.formats.programs.plan import CLOSE, ROWS, Plan, formula, write_program
 from converters.formats.programs.weights import weights_name
 from converters.graph.ops.loops.layers import box_muller, gumbel
 from converters.graph.printer import Printer
@@ -67,9 +67,7 @@ $LINES    _loaded = true;
 
 def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
     """The class. Raises UnsupportedOpError."""
-    plan = plan_of(policy, options)
-    file = {} if plan.weights.file is None else {weights_name(policy.name): Pieces(plan.weights.file)}
-    return {f"{policy.name}.cs": Pieces(_text(policy.name, plan).encode("ascii")), **file}
+    return write_program(policy, options, ".cs", _text)
 
 
 def _text(file: str, plan: Plan) -> str:
@@ -84,13 +82,13 @@ def _text(file: str, plan: Plan) -> str:
     places = [
         (printer.name(s.result.place), CS_TYPES[s.result.dtype.name], s.result.place.size) for s in program.stages
     ]
-    draws = printer.draws or bool(header.noise) or plan.chosen is not None
+    draws = plan.draws(printer)
     members = [
         _sizes(plan),
         "    // What the agent observes.\n" + "".join(map(_member, header.inputs)),
         "    // What it keeps: the stream of its draws, noise, its state.\n"
         + ("    ulong stream;\n" if draws else "")
-        + "".join(_member(f) for f in header.fed if f not in header.inputs),
+        + "".join(_member(f) for f in header.kept),
         "    // What it does.\n" + "".join(map(_member, header.outputs)),
         "    // For computing.\n" + "".join(f"    readonly {k}[] {n} = new {k}[{size}];\n" for n, k, size in places),
     ]
@@ -152,10 +150,7 @@ def _read_whole(plan: Plan, printer: Printer, lines: Sequence[str]) -> list[Plac
 def _beginning(name: str, plan: Plan, *, draws: bool) -> list[str]:
     """The constructor and ``Reset``."""
     header = plan.header
-    quiet = "".join(
-        f"        global::System.Array.Clear(this.{f.name}, 0, {f.size});\n"
-        for f in (*header.noise, *((header.state,) if header.state else ()))
-    )
+    quiet = "".join(f"        global::System.Array.Clear(this.{f.name}, 0, {f.size});\n" for f in header.kept)
     stream = "        stream = seed;\n" if draws else ""
     return [
         "    /// <summary>A new agent, whose draws begin with a seed.</summary>\n"
@@ -219,12 +214,8 @@ def _unusual(plan: Plan, words: CSharp) -> str:
 
 
 def _member(field: Field) -> str:
-    shape = " x ".join(str(n) for n in (field.spec.shape[1:] if field.spec.batched else field.spec.shape))
     kind = CS_TYPES[field.spec.dtype]
-    return (
-        f"    public readonly {kind}[] {field.name} = new {kind}[{field.size}]; "
-        f"// {field.spec.role.value}, {shape or '1'}\n"
-    )
+    return f"    public readonly {kind}[] {field.name} = new {kind}[{field.size}]; // {field.about}\n"
 
 
 def _choose(field: Field, sizes: Sequence[int], printer: Printer) -> str:

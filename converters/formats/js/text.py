@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from converters.formats.programs.weights import Kept
-from converters.graph.language import Language, bare, lines_of, numbers
+from converters.graph.language import Language, bare, lines_of
 from converters.graph.ops.loops.base import Applied, Element
 from converters.graph.ops.loops.own_math import OWN
-from converters.graph.program import Place, every
+from converters.graph.program import every
 from converters.graph.types import BOOL, FLOAT32, INT32, INT64
 
 #: The arrays of each dtype. int64 is held in doubles, which have every whole number up to 2 to the 53.
@@ -62,6 +62,7 @@ _HELPERS = {
 class JavaScript(Language):
     """An ES module."""
 
+    element = "{}"
     functions = (
         {name: f"Math.{name}({{0}})" for name in _SAME}
         | {name: f"_{name}({{0}})" for name in ("erf", "rint")}
@@ -150,7 +151,7 @@ class JavaScript(Language):
             pairs = zip(parts, kept.offsets, strict=True)
             arrays = [f"new {JS_ARRAYS[p.dtype.name]}(bytes.buffer, {offset}, {p.size})" for p, offset in pairs]
         else:
-            arrays = [f"new {JS_ARRAYS[p.dtype.name]}([\n    {lines_of(self._words(p))},\n])" for p in parts]
+            arrays = [f"new {JS_ARRAYS[p.dtype.name]}([\n    {lines_of(self.elements(p))},\n])" for p in parts]
         if kept.step is not None:
             self.helpers["widen"] = _HELPERS["widen"]
             return f"_widen({', '.join(arrays)}, {kept.inner})"
@@ -158,12 +159,3 @@ class JavaScript(Language):
             self.helpers["half"] = _HELPERS["half"]
             return f"Float32Array.from({arrays[0]}, _half)"
         return arrays[0]
-
-    def _words(self, place: Place) -> list[str]:
-        assert place.value is not None
-        value = place.value.reshape(-1)
-        if place.dtype == np.float16:
-            return [str(x) for x in value.view(np.uint16).tolist()]
-        if place.dtype == FLOAT32 and np.isfinite(value).all():
-            return numbers(value, "{}")
-        return [self.literal(x, place.dtype) for x in value.tolist()]

@@ -12,7 +12,7 @@ from converters.files.chunks import Pieces
 from converters.formats.format import WriteOptions
 from converters.formats.js.text import JS_ARRAYS, JavaScript
 from converters.formats.programs.members import Field
-from converters.formats.programs.plan import CLOSE, ROWS, Plan, formula, plan_of
+from converters.formats.programs.plan import CLOSE, ROWS, Plan, formula, write_program
 from converters.formats.programs.weights import weights_name
 from converters.graph.ops.loops.layers import box_muller, gumbel
 from converters.graph.printer import Printer
@@ -58,9 +58,7 @@ $LINES    _loaded = true;
 
 def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
     """The module. Raises UnsupportedOpError."""
-    plan = plan_of(policy, options)
-    file = {} if plan.weights.file is None else {weights_name(policy.name): Pieces(plan.weights.file)}
-    return {f"{policy.name}.mjs": Pieces(_text(policy.name, plan).encode("ascii")), **file}
+    return write_program(policy, options, ".mjs", _text)
 
 
 def _text(name: str, plan: Plan) -> str:
@@ -74,8 +72,7 @@ def _text(name: str, plan: Plan) -> str:
     body = _compute_lines(plan, printer)
     weights = _weights(name, plan, words, printer)
     places = [stage.result.place for stage in program.stages]
-    draws = printer.draws or bool(header.noise) or plan.chosen is not None
-    quiet = [*header.noise, *([header.state] if header.state else [])]
+    draws = plan.draws(printer)
     drawn = "".join(f"        this._normal(this.{f.name});\n" for f in header.noise)
     methods = [
         "    /** A new agent, whose draws begin with a seed. */\n    constructor(seed = 0) {\n"
@@ -84,7 +81,7 @@ def _text(name: str, plan: Plan) -> str:
         + "        this.reset(seed);\n    }",
         "    /** Begins an episode: no state, draws by a seed. */\n    reset(seed = 0) {\n"
         + "        this.stream = BigInt.asUintN(64, BigInt(seed));\n"
-        + "".join(f"        this.{f.name}.fill(0);\n" for f in quiet)
+        + "".join(f"        this.{f.name}.fill(0);\n" for f in header.kept)
         + "    }",
         "    /** Decides: draws the noise where there is some, then computes. */\n    act() {\n"
         + f"{drawn}        this.compute();\n    }}",
@@ -174,9 +171,7 @@ def _unusual(plan: Plan, words: JavaScript) -> str:
 
 
 def _member(field: Field) -> str:
-    shape = " x ".join(str(n) for n in (field.spec.shape[1:] if field.spec.batched else field.spec.shape))
-    about = f"{field.spec.role.value}, {shape or '1'}"
-    return f"        this.{field.name} = new {JS_ARRAYS[field.spec.dtype]}({field.size}); // {about}\n"
+    return f"        this.{field.name} = new {JS_ARRAYS[field.spec.dtype]}({field.size}); // {field.about}\n"
 
 
 def _choose(field: Field, sizes: Sequence[int], printer: Printer) -> str:

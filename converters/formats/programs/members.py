@@ -39,6 +39,12 @@ class Field(Struct, frozen=True):
     spec: TensorSpec
     size: int
 
+    @property
+    def about(self) -> str:
+        """What it is for, and its shape for one agent."""
+        shape = self.spec.shape[1:] if self.spec.batched else self.spec.shape
+        return f"{self.spec.role.value}, {' x '.join(map(str, shape)) or '1'}"
+
 
 class Header(Struct, frozen=True):
     """The members: what is observed, what the memory keeps (the state, draws), what is answered."""
@@ -56,9 +62,14 @@ class Header(Struct, frozen=True):
         return _class_name(self.prefix)
 
     @property
+    def kept(self) -> tuple[Field, ...]:
+        """What an agent keeps: noise, its state."""
+        return (*self.noise, *((self.state,) if self.state else ()))
+
+    @property
     def fed(self) -> tuple[Field, ...]:
         """All that a decision is made of."""
-        return (*self.inputs, *self.noise, *((self.state,) if self.state else ()))
+        return (*self.inputs, *self.kept)
 
     @property
     def answered(self) -> tuple[Field, ...]:

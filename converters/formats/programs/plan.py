@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 
 import numpy as np
 from msgspec import Struct
 
 from converters.compiler.targets import PROGRAM, prepare
+from converters.files.chunks import Pieces
 from converters.formats.format import WriteOptions
 from converters.formats.programs.members import Field, Header, header_of
-from converters.formats.programs.weights import Weights, weights_of
+from converters.formats.programs.weights import Weights, weights_name, weights_of
 from converters.graph.ops.table import traits
+from converters.graph.printer import Printer
 from converters.graph.program import Program, program_of
 from converters.graph.run import run_graph
 from converters.graph.shapes import numbers_made
@@ -54,6 +57,22 @@ class Plan(Struct, frozen=True):
     weights: Weights
     code: CodeOptions
     guarded: tuple[Guarded, ...] = ()
+
+    def draws(self, printer: Printer) -> bool:
+        """Whether an agent draws numbers, once its loops are printed."""
+        return printer.draws or bool(self.header.noise) or self.chosen is not None
+
+
+def write_program(
+    policy: Policy, options: WriteOptions, suffix: str, text: Callable[[str, Plan], str]
+) -> dict[str, Pieces]:
+    """Return the file of a policy's source code, and its weights where they lie beside it.
+
+    ``text`` is given the policy's name and its plan. Raises UnsupportedOpError, UsageError.
+    """
+    plan = plan_of(policy, options)
+    file = {} if plan.weights.file is None else {weights_name(policy.name): Pieces(plan.weights.file)}
+    return {f"{policy.name}{suffix}": Pieces(text(policy.name, plan).encode("ascii")), **file}
 
 
 def plan_of(policy: Policy, options: WriteOptions) -> Plan:

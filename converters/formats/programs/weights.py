@@ -14,17 +14,16 @@ from converters.compiler.passes.weights import Storage, compact
 from converters.graph.ops.loops.base import Element, Expression, Tensor, apply, number
 from converters.graph.program import Place, Program, elements, inline_scalars
 from converters.graph.types import BOOL, FLOAT32, INT64
+from signatures.code import WEIGHTS_FILE
 
 #: dtypes of constants that stay in the source: each language holds them in its own way.
 _IN_SOURCE = (BOOL, INT64)
 _ALIGNED = 4
-#: What the file is called.
-WEIGHTS = "{name}.weights.bin"
 
 
 def weights_name(policy: str) -> str:
     """The file of a policy's weights, the same for every language."""
-    return WEIGHTS.format(name=policy)
+    return WEIGHTS_FILE.format(name=policy)
 
 
 class Kept(Struct, frozen=True, eq=False):
