@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 from converters.compiler.options import CompileOptions
 from converters.formats.source import ReadOptions as FileOptions
@@ -19,6 +19,39 @@ from exporter.verify.report import ParityReport
 from signatures.roles import Role
 
 
+class _ReadKeywords(TypedDict, total=False):
+    """The fields of ReadOptions; None is as if left out."""
+
+    step: int | None
+    brain: str | None
+    inputs: Mapping[str, str | Role] | None
+    outputs: Mapping[str, str | Role] | None
+    values: Mapping[str, float] | None
+    sensors: Sequence[Sequence[int]]
+    goals: Sequence[int]
+    activation: str | None
+    normaliser: Path | str | None
+    interface: Path | str | None
+    trust_source: bool
+
+
+class _Keywords(_ReadKeywords, total=False):
+    """With those of WriteOptions that no field of ReadOptions is called like."""
+
+    names: str
+    noise: str
+    deterministic: bool
+    opset: int | None
+    dtype: str
+    quantize: str | None
+    batch: int | None
+    math: str
+    weights: str
+    guard: float | None
+    bake: str | None
+    labels: Labels | None
+
+
 def export_model(
     source: Path | str | Sequence[Path | str] | None = None,
     out: Path | str = "exported",
@@ -28,67 +61,32 @@ def export_model(
     keras_model: Any = None,
     to: str | Sequence[str] | None = None,
     name: str | None = None,
-    brain: str | None = None,
-    names: str = "canonical",
-    noise: str = "lift",
-    deterministic: bool = False,
-    inputs: Mapping[str, str | Role] | None = None,
-    outputs: Mapping[str, str | Role] | None = None,
-    values: Mapping[str, float] | None = None,
-    step: int | None = None,
-    sensors: Sequence[Sequence[int]] = (),
-    trust_source: bool = False,
-    goals: Sequence[int] = (),
-    activation: str | None = None,
-    normaliser: Path | str | None = None,
-    opset: int | None = None,
     verify: str | Sequence[str] = "auto",
     parity: VerifyOptions | None = None,
-    labels: Labels | None = None,
     strict: bool = True,
     for_: str | None = None,
-    dtype: str = "float32",
-    quantize: str | None = None,
-    batch: int | None = None,
+    **options: Unpack[_Keywords],
 ) -> list[ExportResult]:
     """Export every policy of a source to ``out/<policy>/``, and compare what was written in the installed runtimes.
 
-    ``export_model.export`` with flat keywords: those of ReadOptions (``brain``, ``inputs``, ``outputs``, ``values``,
-    ``step``, ``sensors``, ``goals``, ``activation``, ``normaliser``, ``trust_source``) and of WriteOptions (``names``,
-    ``noise``, ``deterministic``, ``opset``, ``dtype``, ``quantize``, ``batch``, ``labels``). ``verify`` names the
-    runtimes, ``parity`` has seed, samples and tolerances. Raises ExportModelError and its subclasses::
+    ``export_model.export`` with flat keywords: ``options`` are those of ReadOptions (``brain``, ``inputs``,
+    ``outputs``, ``values``, ``step``, ``sensors`` …) and of WriteOptions (``names``, ``noise``, ``opset`` …).
+    ``verify`` names the runtimes, ``parity`` has seed, samples and tolerances. Raises ExportModelError and its
+    subclasses::
 
         (result,) = export_model("3DBall.bytes", "out", to="onnx,tfjs")
         print(result.passed, result.folder, result.policy.signature.inputs)
     """
+    given: dict[str, Any] = {key: value for key, value in options.items() if value is not None}
+    reading = {key: given.pop(key) for key in _ReadKeywords.__annotations__ if key in given}
     return interface.export(
         source,
         out,
         to=to,
         for_=for_,
         name=name,
-        read=ReadOptions(
-            step=step,
-            brain=brain,
-            inputs=inputs or {},
-            outputs=outputs or {},
-            values=values or {},
-            sensors=sensors,
-            goals=goals,
-            activation=activation,
-            normaliser=normaliser,
-            trust_source=trust_source,
-        ),
-        write=WriteOptions(
-            names=names,
-            noise=noise,
-            deterministic=deterministic,
-            opset=opset,
-            dtype=dtype,
-            quantize=quantize,
-            batch=batch,
-            labels=labels,
-        ),
+        read=ReadOptions(**reading),
+        write=WriteOptions(**given),
         verify=interface.judged_by(verify, parity),
         strict=strict,
         session=session,
@@ -97,41 +95,17 @@ def export_model(
     )
 
 
-def inspect_model(
-    source: Path | str,
-    *,
-    brain: str | None = None,
-    inputs: Mapping[str, str | Role] | None = None,
-    outputs: Mapping[str, str | Role] | None = None,
-    values: Mapping[str, float] | None = None,
-    step: int | None = None,
-    sensors: Sequence[Sequence[int]] = (),
-    trust_source: bool = False,
-    goals: Sequence[int] = (),
-    activation: str | None = None,
-    normaliser: Path | str | None = None,
-    why: bool = False,
-) -> Inspection:
+def inspect_model(source: Path | str, *, why: bool = False, **options: Unpack[_ReadKeywords]) -> Inspection:
     """Return the policies of a source with their signatures: ``export_model.inspect`` with flat keywords.
 
-    ``why``: each policy has its ``decisions``, which rule decided what a tensor is for. Raises ExportModelError::
+    ``options`` are those of ReadOptions. ``why``: each policy has its ``decisions``, which rule decided what a tensor
+    is for. Raises ExportModelError::
 
         for found in inspect_model("results/first_run").policies:
             print(found.policy.name, found.policy.signature.inputs, found.targets)
     """
-    read = ReadOptions(
-        step=step,
-        brain=brain,
-        inputs=inputs or {},
-        outputs=outputs or {},
-        values=values or {},
-        sensors=sensors,
-        goals=goals,
-        activation=activation,
-        normaliser=normaliser,
-        trust_source=trust_source,
-    )
-    return interface.inspect(source, read=read, why=why)
+    given: dict[str, Any] = {key: value for key, value in options.items() if value is not None}
+    return interface.inspect(source, read=ReadOptions(**given), why=why)
 
 
 def verify_bundle(
