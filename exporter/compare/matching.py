@@ -64,11 +64,6 @@ class Candidate(Struct, frozen=True):
         return given
 
     @property
-    def format_and_signature(self) -> str:
-        """Its format, and which signature is called where that has some."""
-        return ":".join((self.format.key, *filter(None, [self.ports.options.get("signature")])))
-
-    @property
     def missing(self) -> list[str]:
         """Outputs of the reference that it has no name for."""
         return [p.name for p in self.problems if not p.blocking]

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import numpy as np
 
-from exporter import __version__, reports
+from exporter import __version__
 from exporter.logs.check import LogReport
 from exporter.logs.recording import Array
 from exporter.logs.wording import report_lines, sentence
 from exporter.reports.markup import Markup, el, svg
+from exporter.reports.page import document
 from exporter.reports.sections import section, table
 
 #: Points of a line: of more steps, the worst of each stretch.
@@ -23,26 +23,16 @@ LEFT, RIGHT, TOP, BOTTOM = 44.0, 720.0, 12.0, 200.0
 
 def log_page(report: LogReport) -> str:
     """The document: no scripts, nothing fetched."""
-    css = (Path(reports.__file__).parent / "page.css").read_text(encoding="utf-8")
     title = f"{report.policy}: {report.log}"
-    head = el(
-        "head",
-        el("meta", charset="utf-8"),
-        el("meta", name="viewport", content="width=device-width, initial-scale=1"),
-        el("meta", name="color-scheme", content="light dark"),
-        el("title", title),
-        el("style", Markup(css)),
-    )
     kind = "passed" if report.fits else "failed"
     verdict = el("p", el("span", "Fits" if report.fits else "Different", class_=f"chip {kind}"), " ", sentence(report))
     charts = [section(f"{name}, step by step", _chart(report, name)) for name in report.shares]
-    body = el(
-        "body",
+    return document(
+        title,
         el("header", el("p", "export-model · log", class_="eyebrow"), el("h1", title)),
         el("main", el("article", verdict, _causes(report), charts, _words_section(report))),
         el("footer", f"Written by export-model {__version__}."),
     )
-    return f"<!DOCTYPE html>\n{el('html', head, body, lang='en')}\n"
 
 
 def _causes(report: LogReport) -> Markup | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 from msgspec import Struct
 
@@ -279,33 +279,33 @@ class Size(Finding, frozen=True):
     wrong = "{0.format} is too large: {0.reason}"
 
 
+_Unanswered = TypeVar("_Unanswered", Failure, Undecided)
+
+
 def failure(kind: str, runtime: str, error: RunFailedError, output: str = "*") -> Failure:
     """What a runtime said when it gave no answer."""
-    text = error.what if error.why is None else f"{error.what}: {error.why}"
-    infinite = float("inf")
-    return Failure(
-        format=kind,
-        runtime=runtime,
-        output=output,
-        max_abs_diff=infinite,
-        max_rel_diff=infinite,
-        tolerance=Tolerance(),
-        passed=False,
-        worst_input=None,
-        reason=text.strip(),
-    )
+    return _without_numbers(Failure, kind, runtime, output, _said(error))
 
 
 def undecided_reference(kind: str, runtime: str, error: RunFailedError) -> Undecided:
     """A reference that gave no answer: nothing was held against it."""
-    text = error.what if error.why is None else f"{error.what}: {error.why}"
-    return undecided_finding(kind, runtime, "*", f"the {kind} gave no answer in {runtime}: {text.strip()}")
+    return undecided_finding(kind, runtime, "*", f"the {kind} gave no answer in {runtime}: {_said(error)}")
+
+
+def _said(error: RunFailedError) -> str:
+    return (error.what if error.why is None else f"{error.what}: {error.why}").strip()
 
 
 def undecided_finding(kind: str, runtime: str, output: str, reason: str, where: str | None = None) -> Undecided:
     """What could not be compared, and why."""
+    return _without_numbers(Undecided, kind, runtime, output, reason, where)
+
+
+def _without_numbers(
+    finding: type[_Unanswered], kind: str, runtime: str, output: str, reason: str, where: str | None = None
+) -> _Unanswered:
     infinite = float("inf")
-    return Undecided(
+    return finding(
         format=kind,
         runtime=runtime,
         output=output,

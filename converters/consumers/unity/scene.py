@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from msgspec import Struct
 
 from converters.consumers.mlagents.names import VECTOR, VISUAL
-from converters.consumers.unity.consumers import Consumer, Engine
+from converters.consumers.unity.consumers import Consumer
 from converters.consumers.unity.model import FIRST_VERSION, CheckedModel, InputView
 from converters.consumers.unity.onnx_file import Dims, OnnxFile
 from converters.consumers.unity.rules import observation
@@ -98,8 +98,3 @@ class Scene(Struct, frozen=True):
             names.update({observation(i): shape for i, shape in enumerate(sensors) if len(shape) == 2})
         vectors = sum(shape[0] for shape in sensors if len(shape) == 1)
         return {**names, VECTOR: (vectors,)} if vectors else names
-
-    @property
-    def holds_shapes_as_they_are(self) -> bool:
-        """Sentis keeps the axes of a file; Barracuda has four, N, H, W and C."""
-        return self.consumer.engine is Engine.SENTIS
