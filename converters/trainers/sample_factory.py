@@ -21,7 +21,7 @@ from converters.trainers.pytorch.network import Network
 from converters.trainers.pytorch.weights import Weights, pytorch_alone
 from converters.trainers.rl_games.normaliser import normalise
 from converters.trainers.rsl_rl import per_action
-from converters.trainers.settings import Settings, find_settings
+from converters.trainers.settings import Settings, needed_settings
 from converters.trainers.trainer import Rebuilt, Saved, Trainer
 from signatures.errors import SourceError
 from signatures.roles import Role
@@ -46,16 +46,15 @@ def _state_of(saved: Saved) -> dict[Any, Any] | None:
 
 
 def _rebuild(saved: Saved, state: dict[Any, Any]) -> Rebuilt:
-    saved.refuse_activation("a checkpoint of Sample Factory", "its config.json has it (nonlinearity)")
-    found = find_settings(saved.given, _FILES, _KEYS)
-    if found is None:
-        raise SourceError(
-            "its config.json is missing",
-            why="a checkpoint of Sample Factory has weights; which activation, memory and normaliser they belong to "
-            "stands in the settings of its run, and none of these files is here: " + ", ".join(_FILES),
-            fix="put the run's config.json next to the checkpoint, or give the .pth where the run left it",
-        )
-    settings, file = found
+    settings, file = needed_settings(
+        saved,
+        "Sample Factory",
+        _FILES,
+        _KEYS,
+        why="which activation, memory and normaliser they belong to stands in the settings of its run",
+        fix="put the run's config.json next to the checkpoint, or give the .pth where the run left it",
+        has="it (nonlinearity)",
+    )
     graph, facts = _rebuild_actor(saved, state, settings)
     return Rebuilt(graph, facts, (file,))
 

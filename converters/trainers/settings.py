@@ -126,18 +126,20 @@ def _json_values(data: bytes, name: str) -> Any:
 
 
 def needed_settings(
-    saved: Saved, trainer: str, names: Sequence[str], keys: Sequence[str], *, why: str, fix: str
+    saved: Saved, trainer: str, names: Sequence[str], keys: Sequence[str], *, why: str, fix: str, has: str = ""
 ) -> tuple[Settings, Path]:
     """Return what ``find_settings`` finds. Raises UsageError where activations are given, which the file has.
 
+    The first of ``names`` is what people call the file; ``has`` says where activations stand in it.
     Raises SourceError where there is no such file: ``why`` says what it holds, ``fix`` where the trainer leaves it.
     """
-    saved.refuse_activation(f"a checkpoint of {trainer}", "its agent.yaml has each of them")
+    called = names[0].rpartition("/")[2]
+    saved.refuse_activation(f"a checkpoint of {trainer}", f"its {called} has {has or 'each of them'}")
     found = find_settings(saved.given, names, keys)
     if found is None:
         files = ", ".join(names)
         raise SourceError(
-            "its agent.yaml is missing",
+            f"its {called} is missing",
             why=f"a checkpoint of {trainer} has weights; {why}, and none of these files is here: {files}",
             fix=fix,
         )
