@@ -284,15 +284,15 @@ _Unanswered = TypeVar("_Unanswered", Failure, Undecided)
 
 def failure(kind: str, runtime: str, error: RunFailedError, output: str = "*") -> Failure:
     """What a runtime said when it gave no answer."""
-    return _without_numbers(Failure, kind, runtime, output, _said(error))
+    return _without_numbers(Failure, kind, runtime, output, _error_text(error))
 
 
 def undecided_reference(kind: str, runtime: str, error: RunFailedError) -> Undecided:
     """A reference that gave no answer: nothing was held against it."""
-    return undecided_finding(kind, runtime, "*", f"the {kind} gave no answer in {runtime}: {_said(error)}")
+    return undecided_finding(kind, runtime, "*", f"the {kind} gave no answer in {runtime}: {_error_text(error)}")
 
 
-def _said(error: RunFailedError) -> str:
+def _error_text(error: RunFailedError) -> str:
     return (error.what if error.why is None else f"{error.what}: {error.why}").strip()
 
 

@@ -74,7 +74,7 @@ def _text(name: str, plan: Plan) -> str:
     words = C(p, plan.code.math == "own")
     printer = Printer(words, f"{p}_w_")
     by_name = {f.spec.name: f"input->{f.name}" for f in header.inputs}
-    by_name |= {f.spec.name: f"memory->{f.name}" for f in header.kept}
+    by_name |= {f.spec.name: f"memory->{f.name}" for f in header.own_values}
     for key, tensor in program.inputs.items():
         printer.called(tensor.place, by_name[key])
     body = _compute_lines(plan, printer)
@@ -123,7 +123,7 @@ def _declarations(name: str, plan: Plan, choose: str) -> list[str]:
             [
                 *(["const unsigned char *weights;"] if loads else []),
                 "uint64_t stream;",
-                *map(_member, header.kept),
+                *map(_member, header.own_values),
                 *(
                     f"{c} {arena}[{size}];"
                     for arena, size in program.arenas.items()

@@ -88,7 +88,7 @@ def _text(file: str, plan: Plan) -> str:
         "    // What the agent observes.\n" + "".join(map(_member, header.inputs)),
         "    // What it keeps: the stream of its draws, noise, its state.\n"
         + ("    ulong stream;\n" if draws else "")
-        + "".join(_member(f) for f in header.kept),
+        + "".join(_member(f) for f in header.own_values),
         "    // What it does.\n" + "".join(map(_member, header.outputs)),
         "    // For computing.\n" + "".join(f"    readonly {k}[] {n} = new {k}[{size}];\n" for n, k, size in places),
     ]
@@ -150,7 +150,7 @@ def _read_whole(plan: Plan, printer: Printer, lines: Sequence[str]) -> list[Plac
 def _beginning(name: str, plan: Plan, *, draws: bool) -> list[str]:
     """The constructor and ``Reset``."""
     header = plan.header
-    quiet = "".join(f"        global::System.Array.Clear(this.{f.name}, 0, {f.size});\n" for f in header.kept)
+    quiet = "".join(f"        global::System.Array.Clear(this.{f.name}, 0, {f.size});\n" for f in header.own_values)
     stream = "        stream = seed;\n" if draws else ""
     return [
         "    /// <summary>A new agent, whose draws begin with a seed.</summary>\n"

@@ -81,7 +81,7 @@ def _text(name: str, plan: Plan) -> str:
         + "        this.reset(seed);\n    }",
         "    /** Begins an episode: no state, draws by a seed. */\n    reset(seed = 0) {\n"
         + "        this.stream = BigInt.asUintN(64, BigInt(seed));\n"
-        + "".join(f"        this.{f.name}.fill(0);\n" for f in header.kept)
+        + "".join(f"        this.{f.name}.fill(0);\n" for f in header.own_values)
         + "    }",
         "    /** Decides: draws the noise where there is some, then computes. */\n    act() {\n"
         + f"{drawn}        this.compute();\n    }}",

@@ -62,14 +62,14 @@ class Header(Struct, frozen=True):
         return _class_name(self.prefix)
 
     @property
-    def kept(self) -> tuple[Field, ...]:
+    def own_values(self) -> tuple[Field, ...]:
         """What an agent keeps: noise, its state."""
         return (*self.noise, *((self.state,) if self.state else ()))
 
     @property
     def fed(self) -> tuple[Field, ...]:
         """All that a decision is made of."""
-        return (*self.inputs, *self.kept)
+        return (*self.inputs, *self.own_values)
 
     @property
     def answered(self) -> tuple[Field, ...]:
