@@ -13,7 +13,7 @@ from msgspec import Struct
 
 from converters.compiler.passes.batch_branches import join_branches
 from converters.compiler.passes.clip_by_value import clip_by_value
-from converters.compiler.passes.constant_chains import merge_constants, share, square_differences
+from converters.compiler.passes.constant_chains import drop_zero_biases, merge_constants, share, square_differences
 from converters.compiler.passes.fuse import fuse
 from converters.compiler.passes.int8_products import multiply_products
 from converters.compiler.passes.layout_views import transpose_layout_views
@@ -55,7 +55,7 @@ _LOWER_FOR_TFJS: tuple[Step, ...] = (_on_roots(lower_for_tfjs), _on_roots(clip_b
 TFJS = (*FEWER_OPS, *_LOWER_FOR_TFJS, _FUSE_ACTIVATIONS)
 TFJS_INT8 = (*FEWER_OPS, *_LOWER_FOR_TFJS, _on_roots(multiply_products), _FUSE_ACTIVATIONS)
 ONNX = (*FEWER_OPS, _FUSE, lambda graph, outputs: lower_for_importers(graph))
-LITERT = (*FEWER_OPS, _FUSE)
+LITERT = (*FEWER_OPS, _FUSE, _on_roots(drop_zero_biases))
 PROGRAM = (*FEWER_OPS, _FUSE)
 #: Models for one consumer stay as they were tried in it: without a Split, whether it reads one or not.
 CONSUMER_ONNX = (_on_roots(transpose_layout_views), _FUSE)

@@ -144,6 +144,45 @@ def test_there_is_one_buffer_for_a_constant_and_no_operator_that_a_fused_one_doe
     assert sorted(len(b["data"]) for b in model["buffers"][1:])[-2:] == [32, 256]
 
 
+def test_no_shape_of_a_shape_is_left_and_no_bias_of_zeros(here: RuntimePool, tmp_path: Path) -> None:
+    """A MatMul of rank 3 is one of rank 2 between two shapes; the graph's own shape follows on them."""
+    random = np.random.default_rng(3)
+    made = graph(
+        placeholder("x", (None, 5, 4)),
+        const("w", random.normal(size=(4, 6)).astype(np.float32)),
+        const("zeros", np.zeros(6, np.float32)),
+        const("heads", np.array([-1, 5, 2, 3], np.int32)),
+        const("rows", np.array([-1, 6], np.int32)),
+        node("product", "BatchMatMul", "x", "w", adj_x=False, adj_y=False),
+        node("biased", "BiasAdd", "product", "zeros"),
+        node("split", "Reshape", "biased", "heads"),
+        node("again", "Reshape", "split", "rows"),
+        node("activated", "Relu", "again"),
+        node("turned", "Neg", "split"),
+    )
+    artefact = WRITTEN["litert"].artifact(policy_of(made, ["activated", "turned", "product"]), WriteOptions("{}"))
+    artefact.write(tmp_path)
+    model = decode((tmp_path / artefact.main).read_bytes())
+    (subgraph,) = model["subgraphs"]
+    codes = [model["operator_codes"][o.get("opcode_index", 0)]["builtin_code"] for o in subgraph["operators"]]
+    made_by = {o["outputs"][0]: c for o, c in zip(subgraph["operators"], codes, strict=True)}
+    shapes = [o for o, c in zip(subgraph["operators"], codes, strict=True) if c == BUILTINS["RESHAPE"].code]
+    assert shapes and not any(made_by.get(o["inputs"][0]) == BUILTINS["RESHAPE"].code for o in shapes)
+    assert BUILTINS["ADD"].code not in codes
+    read = {v for o in subgraph["operators"] for v in o["inputs"]} | set(subgraph["outputs"])
+    assert set(range(len(subgraph["tensors"]))) == read | set(subgraph["inputs"])
+    used = {entry.get("buffer", 0) for entry in (*subgraph["tensors"], *model.get("metadata", ()))}
+    assert used == set(range(len(model["buffers"])))
+    x = random.normal(size=(2, 5, 4)).astype(np.float32)
+    product = x @ next(n.value for n in made.nodes if n.name == "w")
+    for runtime in LITERT:
+        with here.process(runtime).load(str(tmp_path / artefact.main), kind="litert") as loaded:
+            found = loaded.run({"x": x}, ["y0", "y1", "y2"])
+        np.testing.assert_allclose(found["y0"], np.maximum(product.reshape(-1, 6), 0), rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(found["y1"], -product.reshape(-1, 5, 2, 3), rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(found["y2"], product, rtol=1e-5, atol=1e-6)
+
+
 def test_signatures_of_the_same_tensors_share_a_function() -> None:
     (policy,) = read_source(path("recurrent")).policies()
     (data,) = WRITTEN["litert"].artifact(policy, WriteOptions("{}")).files.values()

@@ -37,14 +37,6 @@ from tests.litert.sweep import round_trips, written
 interpreter = pytest.importorskip("ai_edge_litert.interpreter", reason="pip install 'export-model[litert]'")
 pytestmark = pytest.mark.xdist_group("litert-reader")
 
-#: Policies of ../shared that the first reading still simplifies (4 of 449, measured 2026-11-24).
-SIMPLER = {
-    "AliBharwani+ml-agents__CustomResidualAttentionWithLayerNorm.onnx",
-    "keras_attention.keras",
-    "keras_conv.keras",
-    "sb3_recurrent_disc_own_forward__legacy_fixed.onnx",
-}
-
 
 @pytest.mark.parametrize("name", FIXTURES)
 def test_a_round_trip_gives_the_same_bytes(name: str, tmp_path: Path) -> None:
@@ -59,7 +51,7 @@ def test_every_policy_gives_the_same_bytes(source: Path, tmp_path: Path, is_new:
     if not is_new("litert", known.policies_or_skip(source)):  # type: ignore[call-arg, arg-type]
         return
     for first, second in round_trips(source, tmp_path):
-        assert (first == second) is (source.name not in SIMPLER)
+        assert first == second
 
 
 def test_a_file_of_ours_is_what_its_contract_says(tmp_path: Path) -> None:

@@ -76,6 +76,18 @@ def merge_constants(graph: Graph, roots: Iterable[str]) -> Graph:
     return editor.prune(outputs)
 
 
+def drop_zero_biases(graph: Graph, roots: Iterable[str]) -> Graph:
+    """The graph without the biases that are zeros: what is read as a sum with zeros has none either."""
+    outputs, editor = {node_of(r) for r in roots}, Editor(graph)
+    for node in graph.nodes:
+        bias = graph.constant(node.inputs[1]) if node.op == "BiasAdd" and node.name not in outputs else None
+        if bias is None or bias.any():
+            editor.keep(node)
+        else:
+            editor.redirect(node.name, editor.resolve(node.inputs[0]))
+    return editor.prune(outputs)
+
+
 def square_differences(graph: Graph, roots: Iterable[str]) -> Graph:
     """The graph with SquaredDifference for a Square of a Sub that nothing else reads."""
     outputs, readers = {node_of(r) for r in roots}, graph.consumers()

@@ -32,6 +32,8 @@ class Shared:
         #: the first is empty: the buffer of what is computed
         self.buffers: list[Table] = [{}]
         self.operators: dict[tuple[str, int], int] = {}
+        #: whether a subgraph has left out what was to be read
+        self.left_out = False
         self._known: dict[tuple[Any, ...], list[tuple[np.ndarray, int]]] = {}
 
     def buffer(self, array: np.ndarray) -> int:
@@ -51,6 +53,17 @@ class Shared:
         """The number of a buffer that holds a text."""
         self.buffers.append({"data": text.encode()})
         return len(self.buffers) - 1
+
+    def drop_unread(self, tensors: Iterable[Table]) -> None:
+        """Leave out the buffers of no tensor, and tell the tensors the others' new numbers."""
+        tensors = list(tensors)
+        used = list(dict.fromkeys((0, *(tensor["buffer"] for tensor in tensors))))
+        if not self.left_out:
+            return
+        numbers = {old: new for new, old in enumerate(used)}
+        self.buffers = [self.buffers[number] for number in used]
+        for tensor in tensors:
+            tensor["buffer"] = numbers[tensor["buffer"]]
 
     def operator(self, name: str, version: int) -> int:
         """The number of an operator in a version."""
@@ -77,6 +90,9 @@ class Subgraph:
         self._values: dict[str, Value] = {}
         self._constants: dict[tuple[int, str, tuple[int, ...]], Value] = {}
         self._made: dict[Value, Table] = {}
+        #: result of a RESHAPE → what it shows; and what stands for such results, too, so that it stays as it is
+        self._shown: dict[Value, Value] = {}
+        self._kept: set[Value] = set()
         self._names = NameScope(())
         self._node = Node("", "")
         wanted = list(outputs)
@@ -96,9 +112,33 @@ class Subgraph:
         return self.types[reference]
 
     def emit(self, op: str, inputs: Sequence[Value], of: TensorType | None = None, **options: Any) -> Value:
-        """An operator more; returns its result."""
-        (value,) = self.emit_several(op, inputs, [self.result if of is None else of], **options)
+        """An operator more; returns its result. A shape of what has another shape is one of what that shows."""
+        kind = self.result if of is None else of
+        known = self._shown.get(inputs[0]) if op == "RESHAPE" else None
+        if known is not None and _is_same_shape(self.kinds[known], kind):
+            self._kept.add(known)
+            return known
+        (value,) = self.emit_several(op, inputs if known is None else [known, *inputs[1:]], [kind], **options)
+        if op == "RESHAPE":
+            self._shown[value] = inputs[0] if known is None else known
         return value
+
+    def drop_unread(self, given: Sequence[Value], fed: Sequence[Value]) -> dict[Value, Value]:
+        """Leave out the shapes that nothing reads, and tensors of nothing; returns the others' new numbers."""
+        read = {v for o in self.operators for v in o["inputs"]} | set(given)
+        gone = {id(o) for v, o in self._made.items() if v in self._shown and v not in read}
+        self.operators = [o for o in self.operators if id(o) not in gone]
+        read_by_each = (v for o in self.operators for v in (*sorted(o["inputs"]), *o["outputs"]))
+        used = dict.fromkeys((*fed, *read_by_each, *given))
+        if not gone:
+            return {value: value for value in used}
+        self.shared.left_out = True
+        numbers = {old: new for new, old in enumerate(v for v in used if v != NONE)}
+        self.tensors = [self.tensors[v] for v in numbers]
+        for entry in self.operators:
+            for side in ("inputs", "outputs"):
+                entry[side] = [numbers.get(v, v) for v in entry[side]]
+        return numbers
 
     def emit_several(
         self, op: str, inputs: Sequence[Value], of: Sequence[TensorType], **options: Any
@@ -181,6 +221,8 @@ class Subgraph:
         made = self._made.get(value)
         if self._reads[reference] != 1 or reference in self._outputs or made is None or made["outputs"] != [value]:
             return None
+        if value in self._kept:
+            return None
         name = next(n for (n, _), i in self.shared.operators.items() if i == made.get("opcode_index", 0))
         told = {f.name for f in TABLES[BUILTINS[name].options]} if BUILTINS[name].options else set()
         # CONCATENATION has the field, and a kernel that takes none (concatenation.cc)
@@ -230,11 +272,18 @@ class Subgraph:
         if value in self._made and value not in taken:
             return value
         self._node, self.result = self.graph.producer(reference), self.types[reference]
-        copied = emit_reshape(self, value, self.result)
+        copied = emit_reshape(self, value, self.result) if value not in self._shown else None
         if copied is None:
             copied = self.emit("CAST", [value], in_data_type=self.result.dtype, out_data_type=self.result.dtype)
         self.tensors[copied]["name"] = self._names.fresh(spec.name)
         return copied
+
+
+def _is_same_shape(a: TensorType, b: TensorType) -> bool:
+    """Of as many elements: then one free axis is as long as the other."""
+    if a.shape is None or b.shape is None or sum(isinstance(d, str) for d in a.shape) > 1:
+        return False
+    return [d if isinstance(d, int) else -1 for d in a.shape] == [d if isinstance(d, int) else -1 for d in b.shape]
 
 
 def _encode_options(options: dict[str, Any]) -> Table:

@@ -38,6 +38,7 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
         subgraphs.append({**subgraph, "name": key})
         turned.update(views)
     notes = {EMBEDDED: options.contract, TENSORS_KEY: TensorMap(turned).dumps()}
+    shared.drop_unread(tensor for subgraph in subgraphs for tensor in subgraph["tensors"])
     metadata = [{"name": name, "buffer": shared.text(text)} for name, text in notes.items() if text]
     model = {
         "version": VERSION,
@@ -69,6 +70,8 @@ def _function(
     given: dict[str, int] = {}
     for spec, reference in zip(outputs, fetches, strict=True):
         given[spec.name] = made.output(spec, reference, given.values())
+    numbers = made.drop_unread([*given.values()], [*fed.values()])
+    fed, given = ({name: numbers[v] for name, v in tensors.items()} for tensors in (fed, given))
     subgraph = {
         "tensors": made.tensors,
         "inputs": list(fed.values()),
