@@ -21,7 +21,7 @@ from tests import known
 from tests.programs.mains import c_main
 
 LINES = Path(__file__).resolve().parents[2] / "build" / "sanitized.jsonl"
-FLAGS = ("-std=c99", "-O1", "-g", "-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all",
+FLAGS = ("-std=c99", "-O1", "-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all",
          "-Wall", "-Wextra", "-Wconversion", "-Werror")  # fmt: skip
 _SELFTEST = "\nint main(void)\n{{\n    if ({p}_selftest(&memory) != 0) return 3;\n"
 
