@@ -255,6 +255,7 @@ def play(
       side, where there is one.
     - ``names``, ``read``, ``verify``: as for ``compare``.
 
+    What a bundle's own formats earned is kept in its parity.json.
     Raises ExportModelError; a difference is not raised, ``passed`` is False::
 
         report = export_model.play("exported/3DBall", "3DBall")

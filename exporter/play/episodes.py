@@ -42,6 +42,13 @@ class Episodes(Struct):
         """Decisions in a second."""
         return self.decisions / max(self.seconds, 1e-9)
 
+    def join(self, others: Episodes) -> Episodes:
+        """Return these and others as one."""
+        returns, lengths, success = (
+            np.concatenate([getattr(e, n) for e in (self, others)]) for n in ("returns", "lengths", "success")
+        )
+        return Episodes(returns, lengths, success, self.seconds + others.seconds)
+
 
 def play_episodes(
     world: World,

@@ -8,6 +8,11 @@ and are no further evidence. Student's interval of the mean difference has to li
 - DIFFERENT: all of the interval in which a right player would be with all but one in a million lies outside.
 - NOT DECIDED: neither, and how many episodes would decide is said.
 
+Where the first episodes do not decide, twice as many others join them, and again: a look at all of them after each.
+The 5 % in which an interval misses are shared among the looks, half of it for the first and an equal part for each of
+the others, so that a player at the margin passes one in forty times on either side however often is looked (the union
+bound), and all the intervals hold together at 95 %.
+
 A right player that is called DIFFERENT stops a release, so that takes far more evidence than 95 %; most pairs are equal
 to the last bit, and the few that are not are far from normal. k equal differences among many episodes are √k standard
 errors, so that no fewer than 23 of 200 episodes make a player DIFFERENT, and a rare accident alone does not.
@@ -36,6 +41,10 @@ PERCENTILES = (5, 95)
 #: Fewer say nothing: twenty equal differences are as rare as FALSE_ALARM where either sign is as likely.
 LEAST_EPISODES = 20
 MOST_EPISODES = 1_000_000
+#: Of the error, what the first look takes, where there are others.
+FIRST_SHARE = 0.5
+#: No others are played where so many times as many as may be would be needed.
+HOPELESS = 4
 #: How surely a player that is right would be found EQUIVALENT with as many episodes as are proposed.
 POWER = 0.95
 
@@ -87,14 +96,32 @@ class Equivalence(Struct, frozen=True):
     needed: int | None = None
 
 
-def equivalence(reference: np.ndarray, candidate: np.ndarray, margin: float) -> Equivalence:
-    """Return the verdict on paired returns, float64 [episodes] each."""
+def look_sizes(first: int, most: int) -> list[int]:
+    """Return how many episodes join at each look: the first, then twice as many each time, at most ``most`` others."""
+    sizes = [first]
+    while sum(sizes[1:]) + 2 * sizes[-1] <= most:
+        sizes.append(2 * sizes[-1])
+    return sizes
+
+
+def share_error(looks: int) -> list[float]:
+    """Return the tail of the interval at each look: their sum is that of CONFIDENCE."""
+    whole = (1 - CONFIDENCE) / 2
+    if looks == 1:
+        return [whole]
+    return [whole * FIRST_SHARE, *[whole * (1 - FIRST_SHARE) / (looks - 1)] * (looks - 1)]
+
+
+def equivalence(
+    reference: np.ndarray, candidate: np.ndarray, margin: float, tail: float = (1 - CONFIDENCE) / 2
+) -> Equivalence:
+    """Return the verdict on paired returns, float64 [episodes] each; the interval misses by ``tail`` on either side."""
     differences = candidate - reference
     count = len(differences)
     mean = float(differences.mean())
     deviation = float(differences.std(ddof=1))
     error = deviation / math.sqrt(count)
-    near = t_quantile((1 - CONFIDENCE) / 2, count - 1) * error
+    near = t_quantile(tail, count - 1) * error
     far = t_quantile(FALSE_ALARM / 2, count - 1) * error
     needed = None
     if abs(mean) + near <= margin:
@@ -102,7 +129,7 @@ def equivalence(reference: np.ndarray, candidate: np.ndarray, margin: float) -> 
     elif abs(mean) - far > margin:
         verdict = DIFFERENT
     else:
-        verdict, needed = NOT_DECIDED, _episodes_needed(mean, deviation, margin, near)
+        verdict, needed = NOT_DECIDED, _episodes_needed(mean, deviation, margin, near, tail)
     equal = int((differences == 0).sum())
     return Equivalence(
         verdict=verdict,
@@ -125,11 +152,9 @@ def mean_interval(values: np.ndarray) -> Interval:
     return Interval(mean, mean - near, mean + near)
 
 
-def _episodes_needed(mean: float, deviation: float, margin: float, near: float) -> int | None:
+def _episodes_needed(mean: float, deviation: float, margin: float, near: float, tail: float) -> int | None:
     """Return the number of episodes that would decide: of a right player where the interval holds 0, else of this."""
-    inside, outside, power = (
-        NormalDist().inv_cdf(1 - tail) for tail in ((1 - CONFIDENCE) / 2, FALSE_ALARM / 2, 1 - POWER)
-    )
+    inside, outside, power = (NormalDist().inv_cdf(1 - beyond) for beyond in (tail, FALSE_ALARM / 2, 1 - POWER))
     if abs(mean) <= near:  # a difference of 0 is as likely as any: its |mean| stays within the power's two-sided bound
         distance, errors = margin, inside + NormalDist().inv_cdf(1 - (1 - POWER) / 2)
     elif abs(mean) < margin:

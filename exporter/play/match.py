@@ -15,7 +15,7 @@ from converters.graph.run import run_graph
 from converters.policy.policy import Policy
 from exporter.acting.policy import LoadedPolicy
 from exporter.play.episodes import Episodes, Watch, play_episodes, turn_seed
-from exporter.play.equivalence import Equivalence, equivalence
+from exporter.play.equivalence import HOPELESS, Equivalence, equivalence, look_sizes, share_error
 from exporter.play.options import PlayOptions
 from exporter.play.recording import Recorder
 from exporter.play.replay import replay
@@ -34,7 +34,7 @@ from signatures.errors import ExportModelError
 from signatures.spec import PolicySignature
 
 Progress = Callable[[str], None]
-#: The turn that no first episodes reach: its seed is that of all others.
+#: Turns that no first episodes reach: their seeds are those of others.
 _MORE = 1 << 31
 
 
@@ -216,8 +216,8 @@ class Match:
 
 
 def seed_of(seed: int, more: int) -> int:
-    """Return the seed of the first episodes (``more`` 0), or of others."""
-    return turn_seed(seed, _MORE) if more else seed
+    """Return the seed of the first episodes (``more`` 0), or of so many others."""
+    return turn_seed(seed, _MORE + more) if more else seed
 
 
 def decide(
@@ -225,18 +225,18 @@ def decide(
 ) -> tuple[Episodes, Equivalence, Episodes]:
     """Return the candidate's episodes, the verdict on them, and the reference's that begin like these.
 
-    Both play the first episodes when called with 0. Where those do not decide, as many others are played as would, if
-    no more than ``most``; these are judged by themselves, so that a player at the margin passes one in forty times in
-    each.
+    Both play the first episodes when called with 0. Where those do not decide, others join them, look by look
+    (exporter/play/equivalence.py), unless far more than ``most`` would be needed.
     """
+    sizes = look_sizes(options.episodes, options.most)
     own, episodes = reference(0), candidate(0)
-    compared = equivalence(own.returns, episodes.returns, margin)
-    doubled = (options.episodes << k for k in range(1, 21))
-    more = next((n for n in doubled if n >= (compared.needed or n + 1)), None)
-    if compared.needed is None or more is None or more > options.most:
-        return episodes, compared, own
-    own, episodes = reference(more), candidate(more)
-    return episodes, equivalence(own.returns, episodes.returns, margin), own
+    for look, tail in enumerate(share_error(len(sizes))):
+        if look:
+            own, episodes = own.join(reference(sizes[look])), episodes.join(candidate(sizes[look]))
+        compared = equivalence(own.returns, episodes.returns, margin, tail)
+        if compared.needed is None or compared.needed > HOPELESS * sum(sizes):
+            break
+    return episodes, compared, own
 
 
 def _run_of(reference: Reference) -> Run:

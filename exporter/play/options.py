@@ -21,7 +21,7 @@ class PlayOptions(Struct, frozen=True):
     margin: str = "1%"
     #: Take the likeliest action and the mean, in place of draws.
     deterministic: bool = False
-    #: Where the episodes do not decide, as many others as would are played, up to this number.
+    #: Where the episodes do not decide, others join them until they do, up to this number.
     most: int = 12_800
 
     def __post_init__(self) -> None:

@@ -7,13 +7,19 @@ from collections import Counter
 import numpy as np
 import pytest
 
+from exporter.play.episodes import Episodes
 from exporter.play.equivalence import (
+    Equivalence,
     Margin,
     equivalence,
+    look_sizes,
     mean_interval,
     parse_margin,
     scale_of,
+    share_error,
 )
+from exporter.play.match import decide
+from exporter.play.options import PlayOptions
 from exporter.play.student import t_quantile, upper_tail
 from exporter.verify.plays import DIFFERENT, EQUIVALENT, NOT_DECIDED
 from signatures.errors import UsageError
@@ -167,19 +173,53 @@ def test_a_player_at_the_margin_is_seldom_equivalent() -> None:
     assert 60 <= passed <= 140
 
 
-def test_a_second_chance_lets_no_more_than_one_in_twenty_at_the_margin_pass() -> None:
-    """Others are judged by themselves, so their chance is added to that of the first."""
+def decided(rng: np.random.Generator, difference: float, most: int, deviation: float = 1.0) -> Equivalence:
+    """The verdict of ``play`` on a player that differs so much, of returns that are noise; the margin is 0.2."""
+
+    def play(more: int, mean: float) -> Episodes:
+        count = more or EPISODES
+        returns = rng.normal(mean, deviation, count)
+        return Episodes(returns, np.ones(count, np.int64), np.ones(count, bool))
+
+    nothing = Episodes(np.zeros(EPISODES), np.ones(EPISODES, np.int64), np.ones(EPISODES, bool))
+
+    def reference(more: int) -> Episodes:
+        return nothing if not more else Episodes(np.zeros(more), np.ones(more, np.int64), np.ones(more, bool))
+
+    options = PlayOptions(EPISODES, most=most, margin="0.2")
+    return decide(reference, lambda more: play(more, difference), options, 0.2)[1]
+
+
+def test_looking_often_lets_no_more_than_one_in_forty_at_the_margin_pass() -> None:
+    """The looks share the error: 1/40 of 1,000 is 25, with a deviation of 5."""
     rng = np.random.default_rng(4)
-    passed = 0
-    for _ in range(2000):
-        for count in (EPISODES, 4 * EPISODES):
-            noise = rng.normal(0, 1, count)
-            verdict = equivalence(np.zeros(count), noise - 0.2, 0.2).verdict
-            if verdict != NOT_DECIDED:
-                break
-        passed += verdict == EQUIVALENT
-    # At most 5 % of 2000, which has a deviation of 10.
-    assert passed <= 0.05 * 2000 + 30
+    found = [decided(rng, -0.2, 12_800) for _ in range(1000)]
+    assert sum(f.verdict == EQUIVALENT for f in found) <= 25 + 3 * 5
+    assert not any(f.verdict == DIFFERENT for f in found)
+    assert max(f.episodes for f in found) == EPISODES + 12_400
+
+
+def test_players_that_are_equally_good_are_decided_in_the_end() -> None:
+    """Noise that 200 episodes do not decide: five times the margin, as in Tennis."""
+    rng = np.random.default_rng(5)
+    found = [decided(rng, 0.0, 12_800, deviation=2.2) for _ in range(300)]
+    assert all(f.verdict == EQUIVALENT for f in found)
+    assert sum(f.episodes > EPISODES for f in found) > 200
+    assert np.mean([f.episodes for f in found]) < 3000
+
+
+def test_one_look_has_all_of_the_error_and_others_share_it() -> None:
+    assert look_sizes(200, 12_800) == [200, 400, 800, 1600, 3200, 6400]
+    assert look_sizes(200, 399) == [200] and look_sizes(20, 0) == [20]
+    for looks in range(1, 9):
+        assert sum(share_error(looks)) == pytest.approx(0.025)
+    assert share_error(1) == [pytest.approx(0.025)]
+
+
+def test_what_no_number_of_episodes_in_reach_decides_is_not_played() -> None:
+    found = decided(np.random.default_rng(6), 0.0, 12_800, deviation=15.0)
+    assert found.verdict == NOT_DECIDED and found.episodes == EPISODES
+    assert found.needed is not None and found.needed > 4 * 12_600
 
 
 def test_as_many_episodes_as_are_proposed_decide() -> None:
