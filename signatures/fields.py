@@ -41,7 +41,7 @@ class FieldError(ValueError):
 
 
 class Record(Struct, frozen=True, omit_defaults=True):
-    """A record that JSON keeps: its fields in order, without those that have their default (see ``explicit_default``)."""
+    """A record that JSON keeps: its fields in order, without those of their default (see ``explicit_default``)."""
 
     def to_dict(self) -> dict[str, Any]:
         """As in JSON."""
