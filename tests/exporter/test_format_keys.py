@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
+from pathlib import Path
 
 from converters.formats.registry import WRITTEN
 from converters.runtimes.registry import RUNTIMES
-from tests.exporter.test_imports import MODULES, name_of
+from tests.exporter.test_imports import MODULES, ROOT, name_of
 
 #: Words of this project's own: others, such as ``c`` and ``bytes``, are those of runtimes, units and languages, too.
 KEYS = WRITTEN.keys() - {r.name for r in RUNTIMES} - {"bytes"}
-#: Files that may still name one: the protocol of TensorFlow's child, and words that stand for something else (fields of
-#: site.json, the name of a snippet).
-MOST = 3
+#: Files that may still name one: the protocol of TensorFlow's child, the runtimes' names in a browser, and words that
+#: stand for something else (a field of site.json and its reader, the name of a snippet, TensorFlow's module in another).
+MOST = 6
+#: Files beside Python that say something to a program: scripts, pages, templates of snippets and of compiled children.
+CODE = {".mjs", ".js", ".html", ".tmpl", ".cs", ".c", ".h", ".sh"}
 
 
 def literals(tree: ast.AST) -> Iterator[str]:
@@ -41,10 +45,35 @@ def outside() -> Iterator[tuple[str, ast.AST]]:
             yield name_of(path), ast.parse(path.read_text(encoding="utf-8"))
 
 
+def named_in(text: str) -> set[str]:
+    """The keys that stand in code that is not Python, as a string or as a property; ``.onnx`` is the suffix of files."""
+    strings = {m[2] for m in re.finditer(r"""(["'`])(\w+)\1""", text)}
+    properties = set(re.findall(r"\w\.(\w+)", text)) - {"onnx"}
+    return KEYS & (strings | properties)
+
+
+def other_code() -> Iterator[Path]:
+    for room in ("converters", "exporter", "signatures"):
+        for path in sorted((ROOT / room).rglob("*")):
+            name = path.relative_to(ROOT).as_posix()
+            inside = name.startswith("converters/formats/") or "node_modules" in path.parts
+            if path.suffix in CODE and path.is_file() and not inside:
+                yield path
+
+
 def test_hardly_a_file_outside_the_rooms_names_a_format() -> None:
     assert {"onnx", "tfjs", "nn", "saved_model"} <= KEYS
     files = [name for name, tree in outside() if KEYS.intersection(literals(tree))]
-    assert len(files) <= MOST, files
+    scripts = list(other_code())
+    assert len(scripts) > 60
+    files += [p.name for p in scripts if named_in(p.read_text(encoding="utf-8"))]
+    assert 0 < len(files) <= MOST, files
+
+
+def test_a_key_in_a_script_would_be_found() -> None:
+    assert named_in("if (kind === 'tfjs') x = site.nn; // a.onnx, \"files\"") == {"tfjs", "nn"}
+    assert named_in('f["onnx"] + `saved_model`') == {"onnx", "saved_model"}
+    assert named_in("find('.onnx'); tfjs.load()") == set()
 
 
 def test_no_decision_hangs_on_a_key() -> None:
