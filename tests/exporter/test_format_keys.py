@@ -14,7 +14,7 @@ from tests.exporter.test_imports import MODULES, ROOT, name_of
 #: Words of this project's own: others, such as ``c`` and ``bytes``, are those of runtimes, units and languages, too.
 KEYS = WRITTEN.keys() - {r.name for r in RUNTIMES} - {"bytes"}
 #: Files that may still name one: the protocol of TensorFlow's child, the runtimes' names in a browser, and words that
-#: stand for something else (a field of site.json and its reader, the name of a snippet, TensorFlow's module in another).
+#: stand for something else (a field of site.json and its reader, the name of a snippet, TensorFlow's own module).
 MOST = 6
 #: Files beside Python that say something to a program: scripts, pages, templates of snippets and of compiled children.
 CODE = {".mjs", ".js", ".html", ".tmpl", ".cs", ".c", ".h", ".sh"}
@@ -46,7 +46,7 @@ def outside() -> Iterator[tuple[str, ast.AST]]:
 
 
 def named_in(text: str) -> set[str]:
-    """The keys that stand in code that is not Python, as a string or as a property; ``.onnx`` is the suffix of files."""
+    """The keys in code that is not Python, as a string or as a property; ``.onnx`` is the suffix of files."""
     strings = {m[2] for m in re.finditer(r"""(["'`])(\w+)\1""", text)}
     properties = set(re.findall(r"\w\.(\w+)", text)) - {"onnx"}
     return KEYS & (strings | properties)

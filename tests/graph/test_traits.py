@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import ast
+import re
+import statistics
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 
 import numpy as np
 import onnx.defs
@@ -23,6 +26,12 @@ NAMES = {*TABLE, *SPELLINGS, *CONTROL_FLOW, *FORBIDDEN, *OUTSIDE}
 #: ONNX's own words, which its room and the tables of those who import it may list.
 ONNX_WORDS = frozenset(schema.name for schema in onnx.defs.get_all_schemas_with_history())
 SPEAK_ONNX = ("converters/formats/onnx/", "converters/consumers/unity/")
+#: Where an op's own entry is, and readers, whose words only look like ops.
+NOT_COUNTED = (
+    "converters/graph/ops/",
+    *SPEAK_ONNX,
+    *(f"converters/formats/{room}/" for room in ("litert/importer", "keras", "torchscript")),
+)
 
 
 def listed(tree: ast.AST, *, translates: bool = False) -> Iterator[tuple[int, set[str]]]:
@@ -74,6 +83,36 @@ def test_no_other_file_lists_ops() -> None:
                 if not (name.startswith(SPEAK_ONNX) and ops <= ONNX_WORDS):
                     found[f"{name}:{line}"] = ops
     assert found == {}
+
+
+def entries(path: Path) -> set[str]:
+    """The ops that have an entry of their own in a file: a key of a table, a part of a list with others."""
+    text = path.read_text(encoding="utf-8")
+    if path.suffix == ".mjs":  # an op's kernel is a key of an object, or the name of one that the object takes
+        words = {m[1] or m[2] for m in re.finditer(r"^\s+(\w+)(?:,|\s*[:(])|[{,]\s*(\w+):", text, re.MULTILINE)}
+        return words & TABLE.keys()
+    found = set[str]()
+    for node in ast.walk(ast.parse(text)):
+        parts = node.keys if isinstance(node, ast.Dict) else getattr(node, "elts", [])
+        ops = {p.value for p in parts if isinstance(p, ast.Constant) and isinstance(p.value, str)} & TABLE.keys()
+        found |= ops if len(ops) > 1 else set()
+    return found
+
+
+def test_an_op_has_two_entries_outside_of_its_own_at_most() -> None:
+    """Its kernel in JavaScript and its layer of a ``.nn``. Readers' tables speak the words of their formats."""
+    places: dict[str, list[str]] = {op: [] for op in TABLE}
+    for room in ("signatures", "converters", "exporter"):
+        for path in sorted((ROOT / room).rglob("*")):
+            name = path.relative_to(ROOT).as_posix()
+            if path.suffix not in (".py", ".mjs") or "node_modules" in name or name.startswith(NOT_COUNTED):
+                continue
+            for op in entries(path):
+                places[op].append(name)
+    counts = [len(files) for files in places.values()]
+    assert statistics.median(counts) <= 2
+    assert {op: files for op, files in places.items() if len(files) > 2} == {}
+    assert any("/js/kernels/" in f for f in places["Tanh"]) and any("barracuda" in f for f in places["Transpose"])
 
 
 def test_a_list_of_ops_would_be_found() -> None:

@@ -9,11 +9,11 @@ from __future__ import annotations
 from converters.graph.editor import Editor
 from converters.graph.nn.activations import leaky_relu, prelu
 from converters.graph.nodes import Graph, Node
+from converters.graph.ops.table import TABLE
 from signatures.errors import GraphError, UnsupportedOpError
 
 _PLAIN = {
-    "_FusedMatMul": "MatMul",
-    "_FusedConv2D": "Conv2D",
+    **{op.fused: op.name for op in TABLE.values() if op.fused},
     "FusedDepthwiseConv2dNative": "DepthwiseConv2dNative",
 }
 #: Activation as ``fused_ops`` names it → the op that computes it ("": a function of ``graph/nn``).
