@@ -31,6 +31,10 @@ if TYPE_CHECKING:
     from converters.policy.policy import Policy
     from signatures.contract import FileEntry
     from signatures.spec import PolicySignature
+if not TYPE_CHECKING:  # what asks a record for its signature looks these names up
+    Storage = Pieces = Fetched = Content = InnerTensors = Loaded = ReadOptions = SourceModel = Jitter = Graph = (
+        Policy
+    ) = FileEntry = PolicySignature = np = Any
 
 Dims = tuple[int | None, ...]
 #: Takes inputs by name, what to fetch, and how rounding is disturbed (None: not at all).

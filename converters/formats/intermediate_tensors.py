@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from msgspec import Struct
@@ -18,6 +18,8 @@ from converters.graph.nodes import split_ref
 
 if TYPE_CHECKING:
     from converters.runtimes.pool import RuntimePool
+if not TYPE_CHECKING:  # what asks a record for its signature looks these names up
+    RuntimePool = Any
 
 Feeds = Mapping[str, np.ndarray]
 Run = Callable[[Feeds, Sequence[str]], dict[str, np.ndarray]]

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from msgspec import Struct
 
 if TYPE_CHECKING:
     from converters.graph.ops.approximations import Arithmetic
+if not TYPE_CHECKING:  # what asks a record for its signature looks these names up
+    Arithmetic = Any
 
 Progress = Callable[[str], None]
 

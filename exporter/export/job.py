@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from msgspec import Struct
 from msgspec.structs import replace
@@ -29,6 +29,8 @@ from signatures.fields import FieldError, printable
 if TYPE_CHECKING:
     from converters.consumers.profile import Profile
     from exporter.verify.participants import PolicyUnderTest
+if not TYPE_CHECKING:  # what asks a record for its signature looks these names up
+    Profile = Any
 
 
 #: Agents that a file may be made for (``--batch``).

@@ -31,6 +31,8 @@ from signatures.spec import PolicySignature, TensorSpec
 
 if TYPE_CHECKING:
     from converters.formats.litert.microcontrollers import Fit
+if not TYPE_CHECKING:  # what asks a record for its signature looks these names up
+    Fit = Any
 
 _FEED = {
     Role.VECTOR: "the agent's vector observation, as the environment gives it{normalised}",
