@@ -101,5 +101,5 @@ def size_with_original(kind: str, sizes: Mapping[str, int], whole: Mapping[str, 
 
 
 def count_text(count: int, one: str, several: str | None = None) -> str:
-    """Return a number with its noun: ``1 source``, ``2 sources``."""
-    return f"{count} {one if count == 1 else several or f'{one}s'}"
+    """Return a number with its noun: ``1 source``, ``2,000 sources``."""
+    return f"{count:,} {one if count == 1 else several or f'{one}s'}"

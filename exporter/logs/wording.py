@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from exporter.logs.check import LogReport
+from exporter.tables import count_text
 
 
 def report_lines(report: LogReport) -> list[str]:
     """What was found, without the last line."""
-    lines = [f"{report.policy}: {report.log}, {_steps(report)} of {_count(report.episodes, 'episode')}"]
+    lines = [f"{report.policy}: {report.log}, {_steps(report)} of {count_text(report.episodes, 'episode')}"]
     lines += [f"  note: {note}" for note in report.notes]
     misfits = int(report.misfits.sum())
     if misfits:
@@ -42,11 +43,7 @@ def sentence(report: LogReport) -> str:
 
 
 def _steps(report: LogReport) -> str:
-    return _count(report.steps, "step")
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number:,} {noun}" + ("" if number == 1 else "s")
+    return count_text(report.steps, "step")
 
 
 def _side(sigmas: float) -> str:
