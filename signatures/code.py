@@ -6,8 +6,9 @@ import math as numbers
 from collections.abc import Mapping
 from typing import Any
 
+from msgspec import Struct
+
 from signatures.errors import UsageError
-from signatures.fields import Record
 
 #: What the file of a policy's weights is called that lies beside its source code.
 WEIGHTS_FILE = "{name}.weights.bin"
@@ -19,7 +20,7 @@ CHOICES: Mapping[str, tuple[str, ...]] = {
 }
 
 
-class CodeOptions(Record, frozen=True):
+class CodeOptions(Struct, frozen=True):
     """What source code is asked for beside the policy.
 
     ``math``: the functions of the language's library, or our own, with the same bits on every processor. ``weights``:
@@ -31,6 +32,11 @@ class CodeOptions(Record, frozen=True):
     weights: str = "source"
     outputs: str = "actor"
     guard: float | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """What is not as usual, as a contract says it."""
+        said = {key: value for key in CHOICES if (value := getattr(self, key)) != CHOICES[key][0]}
+        return said if self.guard is None else {**said, "guard": self.guard}
 
     @classmethod
     def of(cls, tool: Mapping[str, Any]) -> CodeOptions:

@@ -41,7 +41,10 @@ class FieldError(ValueError):
 
 
 class Record(Struct, frozen=True, omit_defaults=True):
-    """A record that JSON keeps: its fields in order, without those of their default (see ``explicit_default``)."""
+    """A record that JSON keeps: its fields in order, without those that are None or empty (see ``explicit_default``).
+
+    msgspec leaves out the very object that is the default: one that is neither would be written after a pickle.
+    """
 
     def to_dict(self) -> dict[str, Any]:
         """As in JSON."""
