@@ -1,4 +1,4 @@
-"""``python -m tests.bench.own_math``: how far the functions of ``--math own`` are off, over all 2^32 floats (20 min).
+"""``python -m tests.bench.own_math``: how far the functions of ``--math own`` are off, over all 2^32 floats (10 min).
 
 Beside the C library in double, compiled by gcc; units in the last place of the true value, a float's least spacing
 below the least normal number. ``pow`` takes two numbers: its bases go over all floats, its exponents over some.
