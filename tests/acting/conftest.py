@@ -9,6 +9,7 @@ import pytest
 from exporter.export.pipeline import ExportOptions, export
 from fixtures import path as fixture
 from tests.acting.bundles import Bundles
+from tests.acting.snippet_bundles import export_all
 
 
 @pytest.fixture(scope="session")
@@ -21,3 +22,9 @@ def bundles(tmp_path_factory: pytest.TempPathFactory) -> Bundles:
         return out / name
 
     return of
+
+
+@pytest.fixture(scope="session")
+def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """All fixtures as bundles, one with labels, one with the trainer's own names."""
+    return export_all(tmp_path_factory.mktemp("snippets"))

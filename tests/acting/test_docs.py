@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from converters.runtimes.javascript.node import js_home, node_executable
-from tests.acting.test_snippets import resolved
+from tests.acting.test_page_snippets import resolved
 from tests.commands import ROOT
 
 PAGE = ROOT / "docs" / "acting.md"

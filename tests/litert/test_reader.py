@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,28 +13,26 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from converters.formats.litert.flatbuffer import Table, decode, encode
 from converters.formats.litert.importer.table import TABLE as OPERATORS
 from converters.formats.litert.reader import read_litert
-from converters.formats.litert.schema import BUILTINS, OPTIONS, TYPES
+from converters.formats.litert.schema import BUILTINS
 from converters.graph.ops.table import TABLE
 from converters.graph.run import run_graph
 from converters.runtimes.pool import RuntimePool
 from exporter.export.pipeline import ExportOptions, export
 from exporter.export.sources import read_source
-from exporter.inspect.inspection import inspect_source
 from exporter.reports.summary import failure_lines
 from fixtures import FIXTURES, path
-from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError, UnsupportedOpError
+from signatures.errors import UnsupportedOpError
 from tests import known
 from tests.commands import ROOT
 from tests.conftest import Chosen
 from tests.graph.harness import policy_of
 from tests.graph.samples import SAMPLES
 from tests.litert import make_models
+from tests.litert.operators import IMAGE, X, answers, floats, ints, model_of
 from tests.litert.sweep import round_trips, written
 
-interpreter = pytest.importorskip("ai_edge_litert.interpreter", reason="pip install 'export-model[litert]'")
 pytestmark = pytest.mark.xdist_group("litert-reader")
 
 
@@ -123,82 +121,6 @@ def test_quantised_and_stateful_models_are_refused_by_name(name: str, theirs: Pa
 
 # ------------------------------------------------------------------ operators
 
-
-#: The first versions that LiteRT has of operators that had none before.
-VERSIONS = {"BROADCAST_TO": 2}
-
-
-def model_of(
-    kind: str,
-    inputs: Sequence[np.ndarray],
-    results: Sequence[str] = ("float32",),
-    fed: int = 1,
-    **options: Any,
-) -> Table:
-    """A model of one operator; the first ``fed`` operands are inputs of the model, the others constants."""
-    buffers: list[Table] = [{}]
-    tensors: list[Table] = []
-    for number, array in enumerate(inputs):
-        tensor: Table = {"type": TYPES[array.dtype][0], "name": f"in{number}", "shape": list(array.shape)}
-        if number >= fed:
-            tensor["buffer"] = len(buffers)
-            buffers.append({"data": array})
-        tensors.append(tensor)
-    tensors += [{"type": TYPES[np.dtype(r)][0], "name": f"out{i}"} for i, r in enumerate(results)]
-    outputs = [len(inputs) + i for i in range(len(results))]
-    operator: Table = {"inputs": [*range(len(inputs))], "outputs": outputs}
-    builtin = BUILTINS[kind]
-    if builtin.options:
-        operator |= {"builtin_options_type": OPTIONS[builtin.options], "builtin_options": options}
-    code = {
-        "deprecated_builtin_code": min(builtin.code, 127),
-        "builtin_code": builtin.code,
-        "version": VERSIONS.get(kind, 1),
-    }
-    return {
-        "version": 3,
-        "operator_codes": [code],
-        "subgraphs": [{"tensors": tensors, "inputs": [*range(fed)], "outputs": outputs, "operators": [operator]}],
-        "buffers": buffers,
-    }
-
-
-def graph_of(model: Table) -> Any:
-    return read_litert(encode(model).to_bytes()).graph
-
-
-def answers(model: Table, feeds: Sequence[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """(what the numpy kernels make of the graph that is read, what LiteRT's own make of the file)."""
-    data = encode(model).to_bytes()
-    runner = interpreter.Interpreter(
-        model_content=data,
-        experimental_op_resolver_type=interpreter.OpResolverType.BUILTIN_WITHOUT_DEFAULT_DELEGATES,
-    )
-    runner.allocate_tensors()
-    for details, array in zip(runner.get_input_details(), feeds, strict=True):
-        runner.set_tensor(details["index"], array)
-    runner.invoke()
-    theirs = [runner.get_tensor(d["index"]) for d in runner.get_output_details()]
-    found = read_litert(data)
-    from converters.compiler.passes.normalise import normalise
-
-    names = [t.name for t in found.signature.outputs.values()]
-    graph = normalise(found.graph, [n.split(":")[0] for n in names])
-    given = {f"in{i}": array for i, array in enumerate(feeds)}
-    ours = run_graph(graph, given, names)
-    return [ours[n] for n in names], theirs
-
-
-def floats(*shape: int) -> np.ndarray:
-    draw = np.random.default_rng(sum(shape))
-    return np.asarray(draw.standard_normal(shape) * 3, np.float32)
-
-
-def ints(*numbers: int) -> np.ndarray:
-    return np.array(numbers, np.int32)
-
-
-X, IMAGE = floats(3, 4), floats(2, 6, 6, 3)
 WINDOW = {"padding": 1, "stride_h": 1, "stride_w": 1}
 DILATED = {"dilation_h_factor": 1, "dilation_w_factor": 1}
 #: What the writer makes none of: operators of other tools, options, forms of operands.
@@ -333,132 +255,3 @@ def test_what_is_written_of_an_op_is_read_as_the_same(op: str) -> None:
         wanted = run_graph(sample.graph, sample.feeds, sample.fetches)
         for name, fetch in zip(names, sample.fetches, strict=True):
             np.testing.assert_allclose(ours[name], wanted[fetch], rtol=2e-6, atol=2e-6, err_msg=sample.title)
-
-
-# ------------------------------------------------------------------ refused
-
-
-def changed(change: Any, kind: str = "FULLY_CONNECTED") -> Table:
-    """A model of one layer, changed."""
-    model = model_of(kind, [X, floats(5, 4), floats(5)])
-    change(model, model["subgraphs"][0])
-    return model
-
-
-QUANTISED = {"scale": [0.5], "zero_point": [0]}
-
-
-def _as_integers(model: Table, subgraph: Table) -> None:
-    subgraph["tensors"][1] |= {"type": TYPES[np.dtype(np.int8)][0], "quantization": QUANTISED}
-
-
-UNREAD: Mapping[str, tuple[Any, str]] = {
-    "quantised weights": (_as_integers, "quantised to int8"),
-    "sparse weights": (lambda m, s: s["tensors"][1].update(sparsity={}), "sparse"),
-    "a variable": (lambda m, s: s["tensors"][1].update(is_variable=1), "keeps its value"),
-    "a custom operator": (lambda m, s: m["operator_codes"][0].update(builtin_code=32, custom_code="Mine"), "Mine"),
-    "an LSTM": (lambda m, s: m["operator_codes"][0].update(builtin_code=44), "UNIDIRECTIONAL_SEQUENCE_LSTM"),
-    "an operator of the future": (lambda m, s: m["operator_codes"][0].update(builtin_code=999), "operator 999"),
-    "an activation of the future": (
-        lambda m, s: s["operators"][0]["builtin_options"].update(activation=5),
-        "activation 5",
-    ),
-    "shuffled weights": (lambda m, s: s["operators"][0]["builtin_options"].update(weights_format=1), "shuffled"),
-    "no weights": (lambda m, s: s["operators"][0].update(inputs=[0, -1]), "operand 1 is missing"),
-}
-
-
-@pytest.mark.parametrize("title", UNREAD)
-def test_what_is_not_read_is_refused_by_name(title: str) -> None:
-    change, says = UNREAD[title]
-    with pytest.raises(UnsupportedOpError) as caught:
-        graph_of(changed(change))
-    assert says in caught.value.message
-
-
-def _repeat(model: Table, subgraph: Table) -> None:
-    """A tensor that is made of what was made of itself."""
-    subgraph["tensors"].append({"name": "between"})
-    model["operator_codes"][0].update(builtin_code=BUILTINS["TANH"].code, deprecated_builtin_code=28)
-    subgraph["operators"] = [{"inputs": [a], "outputs": [b]} for a, b in ((0, 3), (3, 4), (4, 3))]
-
-
-def _shared(model: Table, subgraph: Table) -> None:
-    """A megabyte of weights under a thousand shapes, each of them read."""
-    model["buffers"][1] = {"data": np.zeros(1 << 20, np.uint8)}
-    subgraph["tensors"] += [{"type": 0, "buffer": 1, "name": f"w{i}", "shape": [1 << 18] + [1] * i} for i in range(30)]
-    count = len(subgraph["tensors"])
-    subgraph["operators"] = [
-        {"inputs": [0, *range(count - 30, count)], "outputs": [3]},
-    ]
-    model["operator_codes"][0].update(builtin_code=BUILTINS["ADD_N"].code, deprecated_builtin_code=106)
-
-
-DAMAGED: Mapping[str, tuple[Any, str]] = {
-    "an operand that is not there": (lambda m, s: s["operators"][0].update(inputs=[0, 9]), "tensors[9]"),
-    "an operand below all": (lambda m, s: s["operators"][0].update(inputs=[0, -2]), "tensors[-2]"),
-    "an operand that nothing makes": (
-        lambda m, s: s["operators"][0].update(inputs=[0, 3, 2], outputs=[3]),
-        "nothing makes",
-    ),
-    "an operator twice": (_repeat, "made before"),
-    "an operator of no code": (lambda m, s: s["operators"][0].update(opcode_index=7), "operator_codes[7]"),
-    "a buffer that is not there": (lambda m, s: s["tensors"][1].update(buffer=9), "buffers[9]"),
-    "fewer bytes than its shape": (lambda m, s: s["tensors"][1].update(shape=[5, 5]), "not of the shape"),
-    "a shape that no memory holds": (lambda m, s: s["tensors"][1].update(shape=[2**31 - 1] * 9), "not of the shape"),
-    "lengths below 0": (lambda m, s: s["tensors"][1].update(shape=[-5, -4]), "below 0"),
-    "an input twice": (lambda m, s: s.update(inputs=[0, 0]), "two inputs"),
-    "a result that is no tensor": (lambda m, s: s.update(outputs=[77]), "tensors[77]"),
-    "no function": (lambda m, s: m.update(subgraphs=[]), "subgraphs[0]"),
-    "the same bytes again and again": (_shared, "name the same bytes"),
-    "more results than it has": (
-        lambda m, s: (s["tensors"].append({"name": "y"}), s["operators"][0].update(outputs=[3, 4])),
-        "results",
-    ),
-}
-
-
-@pytest.mark.parametrize("title", DAMAGED)
-def test_a_damaged_file_is_refused(title: str) -> None:
-    change, says = DAMAGED[title]
-    with pytest.raises(DamagedFileError) as caught:
-        graph_of(changed(change))
-    assert says in caught.value.message
-
-
-def test_what_nothing_needs_is_not_looked_at() -> None:
-    """An operator that no output depends on may be any."""
-
-    def change(model: Table, subgraph: Table) -> None:
-        model["operator_codes"].append({"builtin_code": 999})
-        subgraph["tensors"].append({"name": "unused"})
-        subgraph["operators"].append({"opcode_index": 1, "inputs": [0], "outputs": [4]})
-
-    assert "out0" in graph_of(changed(change))
-
-
-def test_a_file_of_another_version_is_refused() -> None:
-    with pytest.raises(NotAPolicyError, match="version 2"):
-        graph_of(changed(lambda model, subgraph: model.update(version=2)))
-
-
-@pytest.mark.parametrize("seed", range(20))
-def test_changed_tables_give_a_graph_or_an_error_of_ours(seed: int, tmp_path: Path) -> None:
-    """Numbers of the tables of a whole policy, changed; ``make fuzz`` tries thousands."""
-    draw = np.random.default_rng(seed)
-    (policy,) = read_source(path("discrete")).policies()
-    model = decode(written(policy, ""))
-    for _ in range(3):
-        subgraph = model["subgraphs"][0]
-        table = draw.choice([*subgraph["tensors"], *subgraph["operators"]])
-        vectors = [k for k in ("shape", "inputs", "outputs") if k in table and len(table[k])]
-        if vectors:
-            numbers = [int(n) for n in table[vectors[0]]]
-            numbers[int(draw.integers(len(numbers)))] = int(draw.choice([-1, 0, 1, 5, 77, 2**31 - 1]))
-            table[vectors[0]] = numbers
-    file = tmp_path / "policy.tflite"
-    file.write_bytes(encode(model).to_bytes())
-    try:
-        inspect_source(file)
-    except ExportModelError as error:
-        assert error.exit_status == 2
