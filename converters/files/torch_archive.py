@@ -84,7 +84,7 @@ class Archive:
             return (native.astype(np.uint32) << 16).view(np.float32)
         return native
 
-    def _persistent(self, identity: tuple[Any, ...]) -> Storage:
+    def _persistent(self, identity: tuple[Any, ...], *, stored: bool = True) -> Storage:
         """``("storage", storage type, key, device, elements)``; before PyTorch 1.6 a view's place follows."""
         if len(identity) < 5 or identity[0] not in ("storage", b"storage"):
             raise _damaged_error("a persistent id must be a storage's", "the pickle is damaged")
@@ -98,7 +98,7 @@ class Archive:
                 fix=_FOREIGN,
             )
         width = 2 if kind.dtype == "bfloat16" else np.dtype(kind.dtype).itemsize
-        if not 0 <= count * width <= len(self._data):
+        if count < 0 or (stored and count * width > len(self._data)):
             raise _damaged_error(
                 f"the storage {key!r} should have {count} numbers, more than the file", "the file is cut off or damaged"
             )

@@ -225,7 +225,7 @@ def _keras() -> list[Files]:
     ]
 
 
-def _stored() -> list[Files]:
+def _hdf5_models() -> list[Files]:
     """The same models as Keras 2 writes them: one HDF5 file of configuration, lists of names and arrays."""
     import h5py
 
@@ -354,7 +354,7 @@ def _tables() -> Iterator[tuple[str, Reader]]:
     yield "VecNormalize", Reader(_normalised, changes.statistics, "policy.zip")
     yield "bundle", Reader(_bundles, changes.bundle, takes="bundle")
     yield "Keras", Reader(_keras, changes.keras_config, "policy.keras", takes="configuration")
-    yield "HDF5", Reader(_stored, changes.hdf5, "policy.h5", takes="stored")
+    yield "HDF5", Reader(_hdf5_models, changes.hdf5, "policy.h5", takes="stored")
     yield "recording", Reader(_recordings, changes.recording, takes="recording")
 
 

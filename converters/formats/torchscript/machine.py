@@ -34,7 +34,10 @@ _TELL = "say what the agent observes: --sensors 48 (one shape per input)"
 
 
 class Machine:
-    """``path`` is the module that is walked through; ``memory`` are the buffers that are inputs, by their keys."""
+    """``path`` is the module that is walked through.
+
+    ``memory`` has the shapes of what is fed back: buffers by their keys, and inputs that are states by their names.
+    """
 
     def __init__(self, archive: ScriptArchive, memory: Mapping[str, tuple[int, ...]]) -> None:
         self.b = Builder(NameScope(()))
@@ -74,13 +77,17 @@ class Machine:
 
     # ------------------------------------------------------------------ inputs and memory
 
-    def input(self, name: str, number: int, shape: Sequence[int | None]) -> Tensor:
+    def input(self, name: str, number: int, shape: Sequence[int | None], dtype: np.dtype[Any] = FLOAT32) -> Tensor:
         """Return an input of the program; what its open axes turn out to be is raised as LengthFoundError."""
-        reference = self.b.named_input(name, FLOAT32, shape, name)
+        reference = self.b.named_input(name, dtype, shape, name)
         for axis, length in enumerate(self.b.shape(reference)):
             if isinstance(length, str):
                 self._open[length] = number, axis
         return Tensor(reference)
+
+    def state(self, name: str) -> Tensor:
+        """Return an input that is a part of the memory, as the step begins."""
+        return Tensor(self._start[name])
 
     def place_of(self, symbol: str) -> tuple[int, int]:
         """Return the input and its axis that an open length is of. Raises SourceError where it is of none."""
@@ -122,12 +129,14 @@ class Machine:
         """Return what a buffer holds in the file."""
         return self._first.get(key)
 
-    def finish_memory(self, memory: Mapping[str, tuple[int, ...]]) -> None:
-        """Make the memory an output."""
+    def finish_memory(self, memory: Mapping[str, tuple[int, ...]], states: Mapping[str, str]) -> None:
+        """Make the memory an output: the buffers as they are now, and ``states``, new values by their names."""
         if not memory:
             return
         self.b.prefix = "memory"
-        parts = [self.b.reshape(self._buffers[key].read(), (1, int(np.prod(shape)))) for key, shape in memory.items()]
+        ends = [states[key] if key in states else self._buffers[key].read() for key in memory]
+        sizes = [int(np.prod(shape)) for shape in memory.values()]
+        parts = [self.b.reshape(end, (1, size)) for end, size in zip(ends, sizes, strict=True)]
         self.output(MEMORY_OUT, self.b.concat(parts, 1))
 
     def output(self, name: str, reference: str) -> None:

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import ast
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
 
 from converters.files.fetch import Fetched
 from converters.files.pickled_objects import Instance
@@ -22,7 +24,9 @@ from converters.formats.torchscript.code import Code
 from converters.formats.torchscript.interpreter import Interpreter
 from converters.formats.torchscript.machine import MEMORY_IN, MEMORY_OUT, Machine
 from converters.formats.torchscript.values import LengthFoundError, Module, Tensor
+from converters.graph.types import FLOAT32
 from converters.policy.facts import DOUBLES_NARROWED, SourceFacts
+from converters.policy.memories import part_of, stem_of
 from signatures.errors import NotAPolicyError, SourceError, UsageError
 from signatures.roles import Role
 
@@ -30,11 +34,21 @@ _MAX_INPUTS, _MAX_AXES = 16, 5
 #: Times that a program is walked through: once more for each length and for its memory.
 _MOST_WALKS = 3 * _MAX_INPUTS
 _FORWARD = "forward"
-#: What the usual buffers of a memory are, as other sources call the parts of theirs.
-_PARTS = {"hidden_state": "h", "cell_state": "c"}
 
 Shape = tuple[int | None, ...]
 Memory = dict[str, tuple[int, ...]]
+#: [layers, agents, hidden].
+_STATE_AXES = 3
+#: What is fed as it is; of other types a trace is fed floats.
+_FED = {np.dtype(name).name: np.dtype(name) for name in ("int32", "int64", "bool")}
+
+
+class _Input(Struct, frozen=True):
+    """A tensor that the module is given: its name, and shape and dtype for one agent."""
+
+    name: str
+    shape: Shape
+    dtype: np.dtype[Any] = FLOAT32
 
 
 def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
@@ -46,31 +60,35 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
         raise NotAPolicyError("holds no module", why="torch.jit.save writes one", fix="give the module itself")
     module, code = Module(archive.value), Code(archive.code)
     names = _inputs(code.method(module.type_name, _FORWARD))
-    shapes = _shapes(names, archive.traced, options.sensors)
+    inputs = _given_inputs(names, archive.traced, options.sensors)
     memory: Memory = {}
     budget = itertools.count()
     for _ in range(_MOST_WALKS):
         machine = Machine(archive, memory)
         try:
-            result = _walk(Interpreter(code, machine, archive.constants, budget), machine, module, names, shapes)
+            result = _walk(Interpreter(code, machine, archive.constants, budget), machine, module, inputs, memory)
         except LengthFoundError as found:
             number, axis = machine.place_of(found.symbol)
-            shapes[number] = tuple(found.length if i == axis else d for i, d in enumerate(shapes[number]))
+            known = tuple(found.length if i == axis else d for i, d in enumerate(inputs[number].shape))
+            inputs[number] = replace(inputs[number], shape=known)
             continue
+        outputs = _outputs(result)
+        found_states = {x.name: _lengths_of(x.shape) for x in _states(machine, inputs, outputs) if x.name not in memory}
         written = machine.written_buffers()
-        if written.keys() <= memory.keys():
-            return [_model(given, machine, result, memory)]
-        memory |= written
+        if not found_states and written.keys() <= memory.keys():
+            return [_model(given, machine, outputs, memory, inputs)]
+        memory |= {**found_states, **written}
     raise SourceError(
         "its inputs and memory do not come to rest", why="each walk through its code finds more", fix="give --sensors"
     )
 
 
-def _walk(
-    interpreter: Interpreter, machine: Machine, module: Module, names: Sequence[str], shapes: Sequence[Shape]
-) -> Any:
-    inputs = [machine.input(name, i, shapes[i]) for i, name in enumerate(names)]
-    return interpreter.call_method(module, _FORWARD, inputs)
+def _walk(interpreter: Interpreter, machine: Machine, module: Module, inputs: Sequence[_Input], memory: Memory) -> Any:
+    given = [
+        machine.state(x.name) if x.name in memory else machine.input(x.name, i, x.shape, x.dtype)
+        for i, x in enumerate(inputs)
+    ]
+    return interpreter.call_method(module, _FORWARD, given)
 
 
 def _inputs(forward: ast.FunctionDef) -> list[str]:
@@ -91,8 +109,8 @@ def _inputs(forward: ast.FunctionDef) -> list[str]:
     return [p.arg for p in needed]
 
 
-def _shapes(names: Sequence[str], traced: Any, sensors: Sequence[tuple[int, ...]]) -> list[Shape]:
-    """The shapes for one agent: as the user says, as it was traced, or one row of what is to be found out."""
+def _given_inputs(names: Sequence[str], traced: Any, sensors: Sequence[tuple[int, ...]]) -> list[_Input]:
+    """The inputs for one agent: as the user says, as it was traced, or one row of what is to be found out."""
     if sensors:
         if len(sensors) != len(names):
             raise UsageError(
@@ -100,46 +118,91 @@ def _shapes(names: Sequence[str], traced: Any, sensors: Sequence[tuple[int, ...]
                 why=", ".join(names),
                 fix="give one for each, in that order",
             )
-        return [(1, *shape) for shape in sensors]
+        return [_Input(name, (1, *shape)) for name, shape in zip(names, sensors, strict=True)]
     inputs = traced.get(_FORWARD) if isinstance(traced, dict) else None
     inputs = inputs if isinstance(inputs, list | tuple) else []
-    known = [i.shape for i in inputs if isinstance(i, Stored) and len(i.shape) <= _MAX_AXES]
+    known = [i for i in inputs if isinstance(i, Stored) and len(i.shape) <= _MAX_AXES]
     if len(known) == len(inputs) == len(names):
-        return [(1, *shape[1:]) if len(shape) > 1 else shape for shape in known]
-    return [(1, None)] * len(names)
+        rows = known[0].shape[0] if known[0].shape else 1
+        dtypes = [_FED.get(i.storage.dtype, FLOAT32) for i in known]
+        return [
+            _Input(name, _for_one_agent(i.shape, rows, dtype, first=i is known[0]), dtype)
+            for name, i, dtype in zip(names, known, dtypes, strict=True)
+        ]
+    return [_Input(name, (1, None)) for name in names]
 
 
-def _model(given: Fetched, machine: Machine, result: Any, memory: Memory) -> SourceModel:
-    machine.check_closed()
-    machine.finish_memory(memory)
+def _for_one_agent(shape: tuple[int, ...], rows: int, dtype: np.dtype[Any], *, first: bool) -> Shape:
+    """The shape of one agent's, of that of ``rows``: whole numbers alone are one each, states are [layers, rows, …]."""
+    if len(shape) < 2:
+        return shape if dtype == FLOAT32 else (1,) * len(shape)
+    if not first and len(shape) == _STATE_AXES and shape[1] == rows and (shape[0] != rows or rows == 1):
+        return (shape[0], 1, shape[2])
+    return (1, *shape[1:])
+
+
+def _states(machine: Machine, inputs: Sequence[_Input], outputs: Sequence[Tensor]) -> Sequence[_Input]:
+    """The inputs that are given back: the last of them, where all outputs but the first have their shapes in order."""
+    count = len(outputs) - 1
+    if not 0 < count < len(inputs):
+        return ()
+    ends = inputs[-count:]
+    same = [x.shape == machine.b.shape(o.read()) for x, o in zip(ends, outputs[1:], strict=True)]
+    return ends if all(same) else ()
+
+
+def _lengths_of(shape: Shape) -> tuple[int, ...]:
+    return tuple(length for length in shape if length is not None)
+
+
+def _outputs(result: Any) -> list[Tensor]:
+    """What forward gives. Raises NotAPolicyError."""
     outputs = [result] if isinstance(result, Tensor) else list(result) if isinstance(result, tuple) else []
     if not outputs or not all(isinstance(o, Tensor) for o in outputs):
         raise NotAPolicyError(
             f"its forward gives a {type(result).__name__}", why="an action is a tensor", fix="give a policy"
         )
+    return outputs
+
+
+def _model(
+    given: Fetched, machine: Machine, outputs: Sequence[Tensor], memory: Memory, inputs: Sequence[_Input]
+) -> SourceModel:
+    machine.check_closed()
+    states = [x.name for x in inputs if x.name in memory]
+    ends = outputs[-len(states) :] if states else []
+    machine.finish_memory(memory, {name: end.read() for name, end in zip(states, ends, strict=True)})
+    acting = outputs[: len(outputs) - len(states)]
     machine.b.prefix = "output"
-    names = ["action"] if len(outputs) == 1 else [f"output_{i}" for i in range(len(outputs))]
-    for name, output in zip(names, outputs, strict=True):
+    names = ["action"] if len(acting) == 1 else [f"output_{i}" for i in range(len(acting))]
+    for name, output in zip(names, acting, strict=True):
         machine.output(name, output.read())
     roles: dict[str, Role | None] = dict.fromkeys(names, Role.ACTION if len(names) == 1 else None)
-    parts = [machine.name_of(key).rpartition(".")[2] for key in memory]
+    inside = [key for key in memory if key not in states]
+    parts = [_part_of(key if key in states else machine.name_of(key).rpartition(".")[2]) for key in memory]
     facts = SourceFacts(
         roles={MEMORY_IN: Role.MEMORY_IN} if memory else {},
         family="TorchScript",
         algorithm="",
         image_layout="NCHW",
-        memory_layout=tuple(_PARTS.get(part, part) for part in parts),
+        memory_layout=tuple(parts) if all(parts) else (),
         outputs={**roles, **({MEMORY_OUT: Role.MEMORY_OUT} if memory else {})},
         notes=(
             "no runtime but PyTorch runs it: the verdict on the export is that its formats are self-consistent",
             *([DOUBLES_NARROWED] if machine.narrowed else []),
-            *([_memory_note(machine, memory)] if memory else []),
+            *([_memory_note(machine, inside)] if inside else []),
+            *([f"its states {', '.join(states)} are one row for each agent: {MEMORY_IN}"] if states else []),
         ),
     )
     return SourceModel(machine.b.graph(), (given.path,), facts)
 
 
-def _memory_note(machine: Machine, memory: Mapping[str, tuple[int, ...]]) -> str:
+def _part_of(name: str) -> str:
+    """What a buffer or a state is, as other sources call the parts of theirs; its own name where that says nothing."""
+    return part_of(stem_of(name)) or name
+
+
+def _memory_note(machine: Machine, memory: Sequence[str]) -> str:
     names = ", ".join(machine.name_of(key) for key in memory)
     firsts = [machine.first_value(key) for key in memory]
     zero = all(first is None or not np.any(first) for first in firsts)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 from converters.formats.torchscript.machine import Machine, unknown_length
 from converters.formats.torchscript.ops.scalars import NUMBERS
 from converters.formats.torchscript.values import LengthFoundError, OpenLength, Tensor
-from converters.graph.nn import activations
+from converters.graph.nn import activations, trigonometry
 from converters.graph.nn.activations import Activation
 from converters.graph.types import BOOL, FLOAT32
 from signatures.errors import UnsupportedOpError
@@ -85,18 +86,32 @@ def _times(m: Machine, value: Any, factor: Any) -> Any:
 
 def _divide(m: Machine, a: Any, b: Any, rounding_mode: Any = None) -> Any:
     if not _tensors(a, b):
-        return m.number(a / b)
+        return m.number(
+            a / b if rounding_mode is None else math.floor(a / b) if rounding_mode == "floor" else int(a / b)
+        )
     left, right = (m.b.cast(r, FLOAT32) for r in m.pair(a, b))
     made = m.b.add("RealDiv", [left, right])
     if rounding_mode is None:
         return Tensor(made)
-    if rounding_mode != "floor":
-        raise UnsupportedOpError("it rounds by another rule", why="floor is known")
-    return Tensor(m.b.add("Floor", [made]))
+    return Tensor(m.b.add("Floor", [made]) if rounding_mode == "floor" else _towards_zero(m, made))
+
+
+def _towards_zero(m: Machine, x: str) -> str:
+    """Cut off what is behind the point."""
+    return m.b.add("Mul", [m.b.add("Sign", [x]), m.b.add("Floor", [m.b.add("Abs", [x])])])
 
 
 def _floor_divided(m: Machine, a: Any, b: Any) -> Any:
     return _divide(m, a, b, "floor") if _tensors(a, b) else m.number(a // b)
+
+
+def _difference(m: Machine, a: Any, b: Any) -> Any:
+    return _with_factor("Sub", "sub")(m, a, b)
+
+
+def _scaled_log(m: Machine, x: Any, base: float) -> Tensor:
+    value = m.b.add("Log", [_floats(m, x)])
+    return Tensor(activations.scale_and_shift(m.b, value, 1 / math.log(base)))
 
 
 def _power(m: Machine, x: Any, exponent: Any) -> Any:
@@ -160,6 +175,52 @@ def _softplus(m: Machine, x: Any, beta: Any = 1, threshold: Any = 20) -> Tensor:
     return Tensor(activations.scale_and_shift(m.b, m.b.add("Softplus", [value]), 1 / float(beta)))
 
 
+def _glu(m: Machine, x: Any, dim: Any = -1) -> Tensor:
+    """The first half times the sigmoid of the second."""
+    value = _floats(m, x)
+    axis = m.b.axis(value, dim)
+    half = m.b.length(value, axis) // 2
+    gate = m.b.add("Sigmoid", [m.b.slice(value, axis, half, None)])
+    return Tensor(m.b.add("Mul", [m.b.slice(value, axis, None, half), gate]))
+
+
+def _hardshrink(m: Machine, x: Any, limit: Any = 0.5) -> Tensor:
+    value = _floats(m, x)
+    kept = m.b.add("Greater", [m.b.add("Abs", [value]), m.b.number(value, float(limit))])
+    return Tensor(m.b.where(kept, value, m.b.number(value, 0)))
+
+
+def _softshrink(m: Machine, x: Any, limit: Any = 0.5) -> Tensor:
+    value = _floats(m, x)
+    inside = activations.clip(m.b, value, -float(limit), float(limit))
+    return Tensor(m.b.add("Sub", [value, inside]))
+
+
+def _threshold(m: Machine, x: Any, threshold: Any, value: Any) -> Tensor:
+    given = _floats(m, x)
+    above = m.b.add("Greater", [given, m.b.number(given, float(threshold))])
+    return Tensor(m.b.where(above, given, m.b.number(given, float(value))))
+
+
+def _rrelu(m: Machine, x: Any, lower: Any = 1 / 8, upper: Any = 1 / 3, training: Any = False, *rest: Any) -> Tensor:
+    if training:
+        return _random(m)
+    return Tensor(activations.leaky_relu(m.b, _floats(m, x), (float(lower) + float(upper)) / 2))
+
+
+def _atan2(m: Machine, y: Any, x: Any) -> Tensor:
+    """The angle of (x, y): that of y/x, half a turn on where x is negative, a quarter where it is 0."""
+    above, beside = (m.b.cast(r, FLOAT32) for r in m.pair(y, x))
+    zero, half = m.b.number(beside, 0), m.b.number(beside, math.pi)
+    upright = m.b.add("Equal", [beside, zero])
+    angle = trigonometry.atan(m.b, m.b.add("RealDiv", [above, m.b.where(upright, m.b.number(beside, 1), beside)]))
+    turn = m.b.where(m.b.add("GreaterEqual", [above, zero]), half, m.b.add("Neg", [half]))
+    left = m.b.add("Less", [beside, zero])
+    angle = m.b.add("Add", [angle, m.b.where(left, turn, m.b.add("Mul", [turn, zero]))])
+    quarter = m.b.add("Mul", [m.b.add("Sign", [above]), m.b.number(beside, math.pi / 2)])
+    return Tensor(m.b.where(upright, quarter, angle))
+
+
 def _clip(low: float | None, high: float | None) -> Callable[..., Tensor]:
     return lambda m, x: Tensor(activations.clip(m.b, _floats(m, x), low, high))
 
@@ -206,6 +267,11 @@ OPS: Mapping[str, Callable[..., Any]] = {
     "leaky_relu": lambda m, x, slope=0.01: Tensor(activations.leaky_relu(m.b, _floats(m, x), float(slope))),
     "prelu": lambda m, x, slope: Tensor(activations.prelu(m.b, _floats(m, x), m.ref(slope))),
     "gelu": _gelu,
+    "glu": _glu,
+    "hardshrink": _hardshrink,
+    "softshrink": _softshrink,
+    "threshold": _threshold,
+    "rrelu": _rrelu,
     "softplus": _softplus,
     "hardtanh": _clamp,
     "clamp": _clamp,
@@ -217,6 +283,18 @@ OPS: Mapping[str, Callable[..., Any]] = {
     "rsub": _with_factor("Sub", "sub", swapped=True),
     "mul": _binary("Mul", "mul"),
     "div": _divide,
+    "trunc": lambda m, x: Tensor(_towards_zero(m, _floats(m, x))),
+    "fix": lambda m, x: Tensor(_towards_zero(m, _floats(m, x))),
+    "atan2": _atan2,
+    "lerp": lambda m, a, b, w: _with_factor("Add", "add")(m, a, _binary("Mul", "mul")(m, _difference(m, b, a), w)),
+    "addcmul": lambda m, x, a, b, value=1: _with_factor("Add", "add")(m, x, _binary("Mul", "mul")(m, a, b), value),
+    "addcdiv": lambda m, x, a, b, value=1: _with_factor("Add", "add")(m, x, _divide(m, a, b), value),
+    "log2": lambda m, x: _scaled_log(m, x, 2),
+    "log10": lambda m, x: _scaled_log(m, x, 10),
+    **{
+        name: _unary(getattr(trigonometry, name))
+        for name in ("sinh", "cosh", "asinh", "acosh", "atanh", "atan", "asin", "acos")
+    },
     "true_divide": _divide,
     "floor_divide": _floor_divided,
     "pow": _power,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -10,9 +11,10 @@ import numpy as np
 from converters.formats.torchscript.machine import Machine
 from converters.formats.torchscript.values import Tensor
 from converters.graph.nn import normalisation, pooling
-from converters.graph.nn.convolution import Window, conv2d
+from converters.graph.nn.activations import scale_and_shift
+from converters.graph.nn.convolution import Window, conv2d, conv2d_transposed
 from converters.graph.nn.linear import matmul
-from converters.graph.types import FLOAT32
+from converters.graph.types import BOOL, FLOAT32
 from signatures.errors import UnsupportedOpError
 
 
@@ -49,9 +51,18 @@ def _window(size: Sequence[int], stride: Any, padding: Any, dilation: Any) -> Wi
     strides, gaps = _numbers(stride or list(size), axes), _numbers(dilation, axes)
     if padding == "valid":
         padding = 0
+    if padding == "same":  # what is odd goes behind
+        wide = [gap * (n - 1) for n, gap in zip(size, gaps, strict=True)]
+        return _of_two_axes(size, strides, gaps, [(n // 2, n - n // 2) for n in wide])
     if isinstance(padding, str):
         raise UnsupportedOpError(f"a padding that is called {padding[:20]!r}", why="numbers are known")
-    pads = [(n, n) for n in _numbers(padding, axes)]
+    return _of_two_axes(size, strides, gaps, [(n, n) for n in _numbers(padding, axes)])
+
+
+def _of_two_axes(
+    size: Sequence[int], strides: Sequence[int], gaps: Sequence[int], pads: Sequence[tuple[int, int]]
+) -> Window:
+    axes = len(size)
     wide = [tuple(v) for v in ((1,) * (2 - axes) + tuple(a) for a in (size, strides, gaps))]
     around = ((0, 0),) * (2 - axes) + tuple(pads)
     if len(around) != 2 or any(len(v) != 2 for v in wide):
@@ -105,6 +116,33 @@ def _conv(
     )
 
 
+def _turn_convolution(
+    m: Machine,
+    x: Any,
+    weight: Any,
+    bias: Any = None,
+    stride: Any = 1,
+    padding: Any = 0,
+    output_padding: Any = 0,
+    groups: Any = 1,
+    dilation: Any = 1,
+) -> Tensor:
+    """The kernel is [in, out per group, …]."""
+    kernel = m.constant_numbers(weight, "the kernel")
+    axes = kernel.ndim - 2
+    if axes not in (1, 2):
+        raise UnsupportedOpError(f"a kernel of {kernel.ndim} axes", why="one and two axes are known")
+    m.expect(m.ref(x), 1, kernel.shape[0])
+    window = _window(kernel.shape[2:], stride, padding, dilation)
+    wide = kernel if axes == 2 else kernel[:, :, None, :]
+    extra = _numbers(output_padding, axes)
+    behind = (extra[0], extra[1]) if axes == 2 else (0, extra[0])
+    made = conv2d_transposed(m.b, _as_image(m, x, axes), wide.transpose(2, 3, 0, 1), window, behind, groups)
+    if bias is not None:
+        made = m.b.add("BiasAdd", [made, m.ref(bias)])
+    return _from_image(m, made, axes)
+
+
 def _traced_conv(
     m: Machine,
     x: Any,
@@ -119,7 +157,17 @@ def _traced_conv(
     *rest: Any,
 ) -> Tensor:
     if transposed:
-        raise UnsupportedOpError("a transposed convolution", why="policies have none")
+        return _turn_convolution(
+            m,
+            x,
+            weight=weight,
+            bias=bias,
+            stride=stride,
+            padding=padding,
+            output_padding=output_padding,
+            groups=groups,
+            dilation=dilation,
+        )
     return _convolution(
         m, x, weight=weight, bias=bias, stride=stride, padding=padding, dilation=dilation, groups=groups
     )
@@ -178,6 +226,81 @@ def _layer_norm(
     return Tensor(made)
 
 
+def _rms_norm(m: Machine, x: Any, shape: Any, weight: Any = None, eps: Any = None) -> Tensor:
+    """Without an epsilon that of float32 is taken (torch/nn/functional.py)."""
+    value = m.ref(x)
+    axis = m.b.rank(value) - len(shape)
+    scale = m.b.floats(np.ones(tuple(shape))) if weight is None else m.ref(weight)
+    least = float(np.finfo(np.float32).eps if eps is None else eps)
+    return Tensor(normalisation.rms(m.b, value, axis, scale, least))
+
+
+def _affine(m: Machine, weight: Any, bias: Any, channels: int) -> tuple[str, str]:
+    scale = m.b.floats(np.ones(channels)) if weight is None else m.ref(weight)
+    return scale, m.b.floats(np.zeros(channels)) if bias is None else m.ref(bias)
+
+
+def _group_norm(
+    m: Machine, x: Any, groups: Any, weight: Any = None, bias: Any = None, eps: Any = 1e-5, *rest: Any
+) -> Tensor:
+    value = m.ref(x)
+    scale, shift = _affine(m, weight, bias, m.b.length(value, 1))
+    return Tensor(normalisation.group(m.b, value, int(groups), scale, shift, float(eps)))
+
+
+def _instance_norm(
+    m: Machine,
+    x: Any,
+    weight: Any,
+    bias: Any,
+    mean: Any,
+    variance: Any,
+    own: Any,
+    momentum: Any,
+    eps: Any,
+    *rest: Any,
+) -> Tensor:
+    """By the row's own statistics (``own``), or by stored ones, as a batch normalisation."""
+    if not own:
+        return _batch_norm(m, x, weight, bias, mean, variance, training=False, momentum=momentum, eps=eps)
+    value = m.ref(x)
+    scale, shift = _affine(m, weight, bias, m.b.length(value, 1))
+    return Tensor(normalisation.instance(m.b, value, scale, shift, float(eps)))
+
+
+def _attention(
+    m: Machine,
+    query: Any,
+    key: Any,
+    value: Any,
+    mask: Any = None,
+    dropout: Any = 0.0,
+    causal: Any = False,
+    scale: Any = None,
+    *rest: Any,
+) -> Tensor:
+    """Softmax(q·kᵀ·scale + mask)·v over the last two axes; ``causal``: no element sees those behind it."""
+    if dropout:
+        raise UnsupportedOpError("dropout of a module that is in training", why="call eval() before it is saved")
+    q, k, v = (m.ref(t) for t in (query, key, value))
+    rank = m.b.rank(k)
+    turned = m.b.transpose(k, [*range(rank - 2), rank - 1, rank - 2])
+    factor = 1 / math.sqrt(m.b.length(q, -1)) if scale is None else float(scale)
+    scores = scale_and_shift(m.b, matmul(m.b, q, turned), factor)
+    if causal:
+        rows, columns = m.b.length(scores, -2), m.b.length(scores, -1)
+        m.b.room(rows * columns)
+        seen = m.b.const(np.tril(np.ones((rows, columns), bool)), "seen")
+        scores = m.b.where(seen, scores, m.b.number(scores, -np.inf))
+    elif mask is not None:
+        given = m.ref(mask)
+        if m.b.dtype(given) == BOOL:
+            scores = m.b.where(given, scores, m.b.number(scores, -np.inf))
+        else:
+            scores = m.b.add("Add", [scores, given])
+    return Tensor(matmul(m.b, m.b.add("Softmax", [scores]), v))
+
+
 def _batch_norm(
     m: Machine,
     x: Any,
@@ -212,6 +335,9 @@ OPS: Mapping[str, Callable[..., Any]] = {
     "addmm": _addmm,
     "conv1d": _conv,
     "conv2d": _conv,
+    "_convolution_mode": _conv,
+    "conv_transpose1d": _turn_convolution,
+    "conv_transpose2d": _turn_convolution,
     "_convolution": _traced_conv,
     "max_pool1d": _max_pool(1),
     "max_pool2d": _max_pool(2),
@@ -219,4 +345,9 @@ OPS: Mapping[str, Callable[..., Any]] = {
     "avg_pool2d": _average_pool(2),
     "layer_norm": _layer_norm,
     "batch_norm": _batch_norm,
+    "rms_norm": _rms_norm,
+    "group_norm": _group_norm,
+    "instance_norm": _instance_norm,
+    "scaled_dot_product_attention": _attention,
+    "baddbmm": _addmm,
 }

@@ -176,6 +176,12 @@ def _flatten(m: Machine, x: Any, start: Any = 0, end: Any = -1) -> Tensor:
     return _reshape(m, x, [*shape[:first], math.prod(inner), *shape[last + 1 :]])
 
 
+def _unflatten(m: Machine, x: Any, dim: Any, sizes: Sequence[Any]) -> Tensor:
+    value = _tensor(x).read()
+    axis, dims = m.b.axis(value, dim), [*_size(m, x)]
+    return _reshape(m, x, [*dims[:axis], *sizes, *dims[axis + 1 :]])
+
+
 def _unsqueeze(m: Machine, x: Any, dim: Any) -> Tensor:
     x = _tensor(x)
     axis = m.b.axis_of(dim, m.b.rank(x.read()) + 1)
@@ -340,6 +346,8 @@ OPS: Mapping[str, Callable[..., Any]] = {
     "split": _split,
     "split_with_sizes": _split_by,
     "chunk": _chunk,
+    "unsafe_chunk": _chunk,
+    "unsafe_split": _split,
     "unbind": _unbind,
     "index_select": _index_select,
     "index": _index,
@@ -348,6 +356,7 @@ OPS: Mapping[str, Callable[..., Any]] = {
     "_unsafe_view": _reshape,
     "view_as": lambda m, x, other: _reshape(m, x, _size(m, other)),
     "flatten": _flatten,
+    "unflatten": _unflatten,
     "unsqueeze": _unsqueeze,
     "squeeze": _squeeze,
     "permute": _permute,

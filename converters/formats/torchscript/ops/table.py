@@ -8,7 +8,16 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from converters.formats.torchscript.ops import elementwise, layers, recurrent, reduction, scalars, shaping
+from converters.formats.torchscript.ops import (
+    choosing,
+    elementwise,
+    images,
+    layers,
+    recurrent,
+    reduction,
+    scalars,
+    shaping,
+)
 
 #: The machine, then the operands.
 Translate = Callable[..., Any]
@@ -16,7 +25,7 @@ Translate = Callable[..., Any]
 
 def _table() -> Mapping[str, Translate]:
     table: dict[str, Translate] = {}
-    for module in (elementwise, layers, recurrent, reduction, scalars, shaping):
+    for module in (elementwise, layers, images, choosing, recurrent, reduction, scalars, shaping):
         for name, function in module.OPS.items():
             dotted = name if "." in name or name in scalars.BARE else f"torch.{name}"
             if dotted in table:
