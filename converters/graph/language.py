@@ -61,6 +61,8 @@ class Language(ABC):
     blocks = False
     #: How a finite float32 stands in an array, where its type is said before.
     element = "{}f"
+    #: What the variable of a loop is declared as.
+    counter = "int"
 
     def __init__(self, own: bool = False) -> None:
         self.helpers: dict[str, str] = {}
@@ -74,9 +76,11 @@ class Language(ABC):
     def declaration(self, dtype: np.dtype, name: str, value: str, *, constant: bool) -> str:
         """A local variable."""
 
-    @abstractmethod
     def loop(self, name: str, first: int, last: int, step: int) -> str:
         """The head of a loop."""
+        return (
+            f"for ({self.counter} {name} = {first}; {name} < {last}; {name}{'++' if step == 1 else f' += {step}'}) {{"
+        )
 
     @abstractmethod
     def cast(self, text: str, source: np.dtype, target: np.dtype) -> str:
@@ -90,9 +94,10 @@ class Language(ABC):
     def own_name(self, function: str) -> str:
         """What a mathematical function of ours is called."""
 
-    @abstractmethod
     def definition(self, name: str, takes: Sequence[str], lines: Sequence[str], result: str) -> str:
         """The definition of a function of float32: its statements, and what it gives."""
+        words = ", ".join(f"float {a}" for a in takes)
+        return "\n".join([f"static float {name}({words})\n{{", *lines, f"    return {result};\n}}"])
 
     @abstractmethod
     def draw(self) -> str:

@@ -27,6 +27,11 @@ Inference = tuple[Sequence[TensorType], Sequence[TensorType], int]
 SourceName = str | tuple[str, ...] | None
 
 
+def joined_name(names: Sequence[str]) -> str | tuple[str, ...]:
+    """The source's name for what was joined of its tensors."""
+    return names[0] if len(names) == 1 else tuple(names)
+
+
 class TensorShape(Struct, frozen=True):
     """A ``shape`` attribute: ``dims`` is None for an unknown rank, an entry is None for a free axis."""
 

@@ -102,8 +102,8 @@ def shares(
     """
     if target.branches:
         return _choice_shares(target, logged, answers, tolerance, explained)
-    wanted = _flat(answers[target.answer]).astype(np.float64)
-    given = _flat(logged).astype(np.float64)
+    wanted = flat_rows(answers[target.answer]).astype(np.float64)
+    given = flat_rows(logged).astype(np.float64)
     allowed = tolerance.atol + tolerance.rtol * np.abs(wanted) + explained.get(target.answer, np.zeros(1))[:, None]
     with np.errstate(invalid="ignore"):
         found = np.abs(given - wanted) / allowed
@@ -113,11 +113,11 @@ def shares(
 def _choice_shares(
     target: Target, logged: Array, answers: Arrays, tolerance: Tolerance, explained: Mapping[str, Array]
 ) -> Array:
-    given = _flat(logged)
+    given = flat_rows(logged)
     if target.scores is None:
-        wanted = _flat(answers[target.answer])
+        wanted = flat_rows(answers[target.answer])
         return np.where(given == wanted, 0.0, BEYOND)
-    scores = _flat(answers[target.scores]).astype(np.float64)
+    scores = flat_rows(answers[target.scores]).astype(np.float64)
     more = explained.get(target.scores, np.zeros(1))
     columns = []
     for part, chosen in _by_branch(target, scores, given):
@@ -131,7 +131,7 @@ def _choice_shares(
 def ties(target: Target, scores: Array) -> Array:
     """Bool [steps, branches]: the two best scores are so close that every choice between them fits."""
     found = []
-    flat = _flat(scores).astype(np.float64)
+    flat = flat_rows(scores).astype(np.float64)
     for part, _ in _by_branch(target, flat, np.zeros((len(flat), len(target.branches)), np.int64)):
         top = np.sort(part, axis=1)[:, -2:]
         found.append(top[:, -1] - top[:, 0] < 1e-3 * np.maximum(1.0, np.abs(top[:, -1])))
@@ -201,15 +201,15 @@ def likelihood(
     """
     if target.branches:
         assert target.scores is not None
-        return _of_classes(target, _flat(logged), _flat(answers[target.scores]).astype(np.float64))
-    mean = _flat(answers[target.answer]).astype(np.float64)
+        return _of_classes(target, flat_rows(logged), flat_rows(answers[target.scores]).astype(np.float64))
+    mean = flat_rows(answers[target.answer]).astype(np.float64)
     if target.spread is not None:
-        spread = _flat(answers[target.spread[0]]).astype(np.float64)
+        spread = flat_rows(answers[target.spread[0]]).astype(np.float64)
         std = np.broadcast_to(np.exp(spread) if target.spread[1] else spread, mean.shape)
     else:
-        steps = [np.abs(_flat(m[target.answer]) - mean) for m in moved]
+        steps = [np.abs(flat_rows(m[target.answer]) - mean) for m in moved]
         std = np.max(steps, axis=0) / NOISE_STEP
-    return _of_numbers(_flat(logged).astype(np.float64), mean, std, clip)
+    return _of_numbers(flat_rows(logged).astype(np.float64), mean, std, clip)
 
 
 def _of_classes(target: Target, choices: Array, scores: Array) -> Likelihood:
@@ -230,8 +230,8 @@ def _of_classes(target: Target, choices: Array, scores: Array) -> Likelihood:
 
 def measured_spread(target: Target, answers: Arrays, moved: Sequence[Arrays], bounds: Array) -> Array:
     """The usual standard deviation of each column: the median over the steps at which the mean is not clipped, or 0."""
-    mean = _flat(answers[target.answer]).astype(np.float64)
-    std = np.max([np.abs(_flat(m[target.answer]) - mean) for m in moved], axis=0) / NOISE_STEP
+    mean = flat_rows(answers[target.answer]).astype(np.float64)
+    std = np.max([np.abs(flat_rows(m[target.answer]) - mean) for m in moved], axis=0) / NOISE_STEP
     known = (std > 1e-9) & (mean > bounds[0] + 1e-6) & (mean < bounds[1] - 1e-6)
     return np.asarray([float(np.median(s[k])) if k.any() else 0.0 for s, k in zip(std.T, known.T, strict=True)])
 
@@ -281,5 +281,6 @@ def _erfc(x: Array) -> Array:
     return found
 
 
-def _flat(array: Array) -> Array:
+def flat_rows(array: Array) -> Array:
+    """An array as rows of numbers."""
     return array.reshape(len(array), -1)

@@ -8,7 +8,17 @@ import numpy as np
 from msgspec import Struct
 
 from exporter.logs.causes import Cause
-from exporter.logs.judging import BEYOND, NOISE_STEP, Clip, Likelihood, Target, likelihood, measured_spread, shares
+from exporter.logs.judging import (
+    BEYOND,
+    NOISE_STEP,
+    Clip,
+    Likelihood,
+    Target,
+    flat_rows,
+    likelihood,
+    measured_spread,
+    shares,
+)
 from exporter.logs.recording import NONE, Array, Arrays, Recording
 from exporter.logs.replay import CHUNK_ELEMENTS, MemoryUse, Replay
 from exporter.verify.tolerances import Tolerance
@@ -174,7 +184,7 @@ class Trials:
         names = [n for n in dict.fromkeys([*target.output_names, target.answer]) if n in found]
         for cause in chain:
             if cause.answers is not None and cause.output == target.name:
-                changed = {n: cause.answers(_rows(found[n]).astype(np.float64), self.recording) for n in names}
+                changed = {n: cause.answers(flat_rows(found[n]).astype(np.float64), self.recording) for n in names}
                 found = {**found, **changed}
         return found
 
@@ -193,7 +203,9 @@ class Trials:
         found = {}
         for target in self.targets:
             if target.noisy:
-                bounds = np.stack([_end(_rows(a[target.answer]), sign) for a, sign in zip(far, (-1, 1), strict=True)])
+                bounds = np.stack(
+                    [_end(flat_rows(a[target.answer]), sign) for a, sign in zip(far, (-1, 1), strict=True)]
+                )
                 found[target.name] = Clip(bounds, measured_spread(target, plain, moved, bounds))
         return found
 
@@ -210,18 +222,14 @@ def _use(chain: Chain) -> MemoryUse:
 
 
 def _blank_rows(answers: Arrays, target: Target) -> Array:
-    numbers: Array = _rows(answers[target.output_names[0]]).astype(np.float64)
+    numbers: Array = flat_rows(answers[target.output_names[0]]).astype(np.float64)
     return np.asarray(np.isnan(numbers).all(axis=1))
-
-
-def _rows(array: Array) -> Array:
-    return array.reshape(len(array), -1)
 
 
 def _largest_move(exact: Array, moved: Sequence[Array]) -> Array:
     """How far the largest element of each row moved: float64 [rows]."""
     if exact.dtype.kind != "f":
         return np.zeros(len(exact))
-    steps = [np.abs(_rows(m).astype(np.float64) - _rows(exact)).max(axis=1, initial=0.0) for m in moved]
+    steps = [np.abs(flat_rows(m).astype(np.float64) - flat_rows(exact)).max(axis=1, initial=0.0) for m in moved]
     found: Array = np.nan_to_num(np.max(steps, axis=0), nan=0.0, posinf=0.0)
     return found.clip(0.0, BEYOND)

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from converters.compiler.options import CompileOptions
 from converters.graph.editor import Editor
-from converters.graph.nodes import Graph, Node, TensorShape, node_of, normal_ref, split_ref
+from converters.graph.nodes import Graph, Node, TensorShape, joined_name, node_of, normal_ref, split_ref
 from converters.graph.shapes import infer_types
 from converters.graph.types import FLOAT32, static_shape
 from converters.policy.facts import SourceFacts
@@ -158,7 +158,7 @@ def _rewrite(graph: Graph, memories: Sequence[SeparateMemory], origins: Mapping[
     editor = Editor(graph)
     taken = editor.add_name(CANONICAL[Role.MEMORY_IN])
     attrs = {"dtype": FLOAT32, "shape": TensorShape((None, sum(_size(m.taken) for m in memories)))}
-    editor.keep(Node(taken, "Placeholder", attrs=attrs, origin=_all([origins[m.input] for m in memories])))
+    editor.keep(Node(taken, "Placeholder", attrs=attrs, origin=joined_name([origins[m.input] for m in memories])))
     begin = 0
     for memory in memories:
         end = begin + _size(memory.taken)
@@ -169,7 +169,7 @@ def _rewrite(graph: Graph, memories: Sequence[SeparateMemory], origins: Mapping[
         if node.name not in gone:
             editor.keep(node)
     columns = [_columns(editor, memory) for memory in memories]
-    name, origin = CANONICAL[Role.MEMORY_OUT], _all([origins[m.output] for m in memories])
+    name, origin = CANONICAL[Role.MEMORY_OUT], joined_name([origins[m.output] for m in memories])
     if len(columns) == 1:
         given = editor.add("Identity", columns, name, origin)
     else:
@@ -225,7 +225,3 @@ def _origin(graph: Graph, reference: str) -> str:
     name, index = split_ref(reference)
     origin = graph[name].origin
     return origin if index == 0 and isinstance(origin, str) else f"{name}:{index}"
-
-
-def _all(origins: Sequence[str]) -> str | tuple[str, ...]:
-    return origins[0] if len(origins) == 1 else tuple(origins)

@@ -20,7 +20,7 @@ from converters.formats.barracuda.layer_builder import MAX_ELEMENTS, LayerBuilde
 from converters.formats.barracuda.layers import check_bypassed, translate
 from converters.formats.barracuda.slices import upstream
 from converters.formats.barracuda.vocabulary import LayerType, draws_in_model
-from converters.graph.nodes import Graph, NameScope
+from converters.graph.nodes import Graph, NameScope, joined_name
 from converters.graph.types import FLOAT32, INT32, INT64
 from signatures.errors import DamagedFileError, ExportModelError, SignatureError
 from signatures.roles import ACTION_NAMES, ACTION_SHAPE, OUTPUT_NAMES, VERSION_NUMBER, Role
@@ -152,7 +152,7 @@ class _Reader:
                 why=f"a memory has at least one, and all together have at most {MAX_ELEMENTS}",
                 fix="copy or download the .nn again",
             )
-        self.builder.named_input(MEMORY_IN, FLOAT32, (None, sum(sizes)), _name_or_names([m.input for m in memories]))
+        self.builder.named_input(MEMORY_IN, FLOAT32, (None, sum(sizes)), joined_name([m.input for m in memories]))
         start = 0
         for memory, (h, w, c), size in zip(memories, shapes, sizes, strict=True):
             part, name = MEMORY_IN, self.nodes[memory.input]
@@ -181,7 +181,7 @@ class _Reader:
                 )
             parts.append(b.as_matrix(value))
         joined = parts[0] if len(parts) == 1 else b.add("ConcatV2", [*parts, b.ints(1, "axis")])
-        b.finish(joined, begun, MEMORY_OUT, _name_or_names([m.output for m in memories]))
+        b.finish(joined, begun, MEMORY_OUT, joined_name([m.output for m in memories]))
 
     # ------------------------------------------------------------------ layers
 
@@ -223,10 +223,6 @@ class _Reader:
             # An action that was drawn: Unity makes floats of the classes, a policy gives integers.
             return replace(result, integer=b.finish(result.integer, begun, name, layer.name))
         return replace(result, reference=b.finish(result.reference, begun, name, layer.name))
-
-
-def _name_or_names(names: list[str]) -> str | tuple[str, ...]:
-    return names[0] if len(names) == 1 else tuple(names)
 
 
 def _by_name(model: NnModel) -> dict[str, Layer]:

@@ -73,10 +73,6 @@ class C(Language):
         """A local variable."""
         return f"{'const ' if constant else ''}{C_TYPES[dtype.name]} {name} = {value};"
 
-    def loop(self, name: str, first: int, last: int, step: int) -> str:
-        """The head of a loop."""
-        return f"for (int {name} = {first}; {name} < {last}; {name}{'++' if step == 1 else f' += {step}'}) {{"
-
     def cast(self, text: str, source: np.dtype, target: np.dtype) -> str:
         """A number of another dtype; a float outside of an integer's range, which C leaves open, is the least one."""
         kind = C_TYPES[target.name]
@@ -112,11 +108,6 @@ class C(Language):
     def own_name(self, function: str) -> str:
         """As the C library's, behind the prefix."""
         return f"{self.prefix}_{function}f"
-
-    def definition(self, name: str, takes: Sequence[str], lines: Sequence[str], result: str) -> str:
-        """A static function."""
-        words = ", ".join(f"float {a}" for a in takes)
-        return "\n".join([f"static float {name}({words})\n{{", *lines, f"    return {result};\n}}"])
 
     def draw(self) -> str:
         """The next number of an agent's stream."""

@@ -134,10 +134,6 @@ class CSharp(Language):
         """A local variable."""
         return f"{CS_TYPES[dtype.name]} {name} = {value};"
 
-    def loop(self, name: str, first: int, last: int, step: int) -> str:
-        """The head of a loop."""
-        return f"for (int {name} = {first}; {name} < {last}; {name}{'++' if step == 1 else f' += {step}'}) {{"
-
     def cast(self, text: str, source: np.dtype, target: np.dtype) -> str:
         """A number of another dtype; a float outside of an integer's range, which C# leaves open, is the least one."""
         kind = CS_TYPES[target.name]
@@ -179,11 +175,6 @@ class CSharp(Language):
     def own_name(self, function: str) -> str:
         """As in Math, with a capital."""
         return f"_{function.capitalize()}"
-
-    def definition(self, name: str, takes: Sequence[str], lines: Sequence[str], result: str) -> str:
-        """A static method."""
-        words = ", ".join(f"float {a}" for a in takes)
-        return "\n".join([f"static float {name}({words})\n{{", *lines, f"    return {result};\n}}"])
 
     def block(self, name: str, packed: str, at: str) -> str:
         """A reference to the next block."""

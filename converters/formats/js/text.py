@@ -62,7 +62,7 @@ _HELPERS = {
 class JavaScript(Language):
     """An ES module."""
 
-    element = "{}"
+    element, counter = "{}", "let"
     functions = (
         {name: f"Math.{name}({{0}})" for name in _SAME}
         | {name: f"_{name}({{0}})" for name in ("erf", "rint")}
@@ -85,10 +85,6 @@ class JavaScript(Language):
     def declaration(self, dtype: np.dtype, name: str, value: str, *, constant: bool) -> str:
         """A local variable."""
         return f"{'const' if constant else 'let'} {name} = {value};"
-
-    def loop(self, name: str, first: int, last: int, step: int) -> str:
-        """The head of a loop."""
-        return f"for (let {name} = {first}; {name} < {last}; {name}{'++' if step == 1 else f' += {step}'}) {{"
 
     def cast(self, text: str, source: np.dtype, target: np.dtype) -> str:
         """A number of another dtype; a float outside of an integer's range is the least one."""
