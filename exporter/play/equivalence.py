@@ -112,6 +112,15 @@ def share_error(looks: int) -> list[float]:
     return [whole * FIRST_SHARE, *[whole * (1 - FIRST_SHARE) / (looks - 1)] * (looks - 1)]
 
 
+def is_out_of_reach(compared: Equivalence, episodes: int, tail: float) -> bool:
+    """Whether even a player without any difference would need more than HOPELESS times as many episodes.
+
+    The difference that was seen says nothing here: of a right player it lies near the margin by chance.
+    """
+    errors = NormalDist().inv_cdf(1 - tail) + NormalDist().inv_cdf(1 - (1 - POWER) / 2)
+    return compared.deviation * errors > compared.margin * math.sqrt(HOPELESS * episodes)
+
+
 def equivalence(
     reference: np.ndarray, candidate: np.ndarray, margin: float, tail: float = (1 - CONFIDENCE) / 2
 ) -> Equivalence:

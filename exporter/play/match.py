@@ -15,7 +15,7 @@ from converters.graph.run import run_graph
 from converters.policy.policy import Policy
 from exporter.acting.policy import LoadedPolicy
 from exporter.play.episodes import Episodes, Watch, play_episodes, turn_seed
-from exporter.play.equivalence import HOPELESS, Equivalence, equivalence, look_sizes, share_error
+from exporter.play.equivalence import Equivalence, equivalence, is_out_of_reach, look_sizes, share_error
 from exporter.play.options import PlayOptions
 from exporter.play.recording import Recorder
 from exporter.play.replay import replay
@@ -23,7 +23,7 @@ from exporter.play.worlds import MakeWorld
 from exporter.verify.checks.rollout import rollout
 from exporter.verify.findings import Finding
 from exporter.verify.participants import Participant, PolicyUnderTest
-from exporter.verify.plays import CONFIDENCE, DIFFERENT, EQUIVALENT
+from exporter.verify.plays import CONFIDENCE, DIFFERENT, EQUIVALENT, NOT_DECIDED
 from exporter.verify.reference import Reference
 from exporter.verify.report import ParityReport
 from exporter.verify.session import Session
@@ -234,7 +234,7 @@ def decide(
         if look:
             own, episodes = own.join(reference(sizes[look])), episodes.join(candidate(sizes[look]))
         compared = equivalence(own.returns, episodes.returns, margin, tail)
-        if compared.needed is None or compared.needed > HOPELESS * sum(sizes):
+        if compared.verdict != NOT_DECIDED or is_out_of_reach(compared, sum(sizes), tail):
             break
     return episodes, compared, own
 
