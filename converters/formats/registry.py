@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Collection
 
 from converters.formats.format import Format
 from signatures.errors import UsageError, suggestion
@@ -32,6 +33,8 @@ FORMATS: tuple[Format, ...] = tuple(
 #: What can be written, by key; and what is, where nobody says what.
 WRITTEN = {f.key: f for f in FORMATS if f.write is not None}
 DEFAULTS = tuple(f.key for f in WRITTEN.values() if f.default)
+#: The runtime that is our own kernels.
+KERNELS = "numpy"
 #: Those that other rooms mean by what they are: what the numpy kernels run, pages load, Unity imports and compiles,
 #: boards run.
 FROZEN_GRAPH, SAVED_MODEL, TFJS, ONNX, BARRACUDA, CSHARP, LITERT = (
@@ -53,3 +56,8 @@ def narrows(key: str) -> bool:
     """Whether a format lacks dtypes; ``key`` may name a signature (``saved_model:deterministic``)."""
     found = WRITTEN.get(key.partition(":")[0])
     return found is not None and bool(found.dtypes)
+
+
+def own_reference(keys: Collection[str]) -> Format | None:
+    """The first of a bundle's formats that the numpy kernels run: what it is verified against without its source."""
+    return next((f for f in WRITTEN.values() if f.key in keys and KERNELS in f.runtimes), None)

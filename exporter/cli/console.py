@@ -208,8 +208,10 @@ class Console(Struct, frozen=True):
             details += [f"also called {', '.join(profile.aliases)}"] if profile.aliases else []
             say_paragraph("; ".join(details), indent, indent)
 
-    def next_step(self, results: Sequence[ExportResult], names: str, profile: str | None = None) -> None:
-        """What to do next, in a line or two."""
+    def next_step(
+        self, results: Sequence[ExportResult], names: str, profile: str | None = None, sources: Sequence[Path] = ()
+    ) -> None:
+        """What to do next, in a line or two; ``sources`` are what was exported, as it was typed."""
         if not results or self._silent or self.quiet:
             return
         failed = next((r for r in results if r.passed is False), None)
@@ -223,6 +225,8 @@ class Console(Struct, frozen=True):
             from exporter.tables import command_text
 
             wanted = known(profile)
+            for line in _to_verify(last, sources):
+                say(f"next: {line}")
             place = f"give {files} of {last.folder} to {' and '.join(wanted.loaders)}"
             if not wanted.loaders:
                 place = f"put {files} of {last.folder} into a project of {wanted.purpose}"
@@ -232,7 +236,7 @@ class Console(Struct, frozen=True):
         ours = results[-1].policy.signature.family.startswith("ML-Agents")
         if ours and names == "canonical" and _can_be_dressed(results[-1].sizes):
             say_paragraph("note: Unity looks up other names: export with --for unity6 (--for help: the others)")
-        say(f"next: {_next(results)}")
+        say(f"next: {_next(results, sources)}")
 
     def json(self, content: Mapping[str, Any]) -> None:
         """The answer for a program, where it was asked for."""
@@ -247,7 +251,29 @@ def _can_be_dressed(sizes: Mapping[str, int]) -> bool:
     return any(WRITTEN[key].unity for key in sizes)
 
 
-def _next(results: Sequence[ExportResult]) -> str:
+def _verify_again(result: ExportResult, sources: Sequence[Path]) -> str:
+    """The command that verifies a bundle: with its source, where it has no file that is a reference."""
+    from converters.formats.registry import own_reference
+    from exporter.tables import command_text
+
+    if own_reference(result.sizes) is not None:
+        return command_text("verify", result.folder)
+    named = [s for s in sources if s.name == result.agreed.origin.path]
+    return command_text("verify", result.folder, "--source", *(named or [Path(result.agreed.origin.path)])[:1])
+
+
+def _to_verify(result: ExportResult, sources: Sequence[Path]) -> list[str]:
+    """How to get a runtime, and what to verify then, where none ran."""
+    from exporter.reports.summary import to_verify
+    from exporter.tables import hint
+
+    if result.report is None or result.report.passed is not None:
+        return []
+    install = to_verify(result.report)
+    return [] if install is None else [hint(install, f"then: {_verify_again(result, sources)}")]
+
+
+def _next(results: Sequence[ExportResult], sources: Sequence[Path]) -> str:
     """The one command that is worth most now: for the policy that the page has a scene for, else the last."""
     from exporter.tables import command_text, hint
 
@@ -257,13 +283,9 @@ def _next(results: Sequence[ExportResult]) -> str:
 
         last = next((r for r in results if scene_of(r.policy.name, r.policy.signature) is not None), last)
     if last.report is None:
-        return hint(command_text("verify", last.folder), "nothing was compared yet")
-    if last.report.passed is None:
-        from exporter.reports.summary import to_verify
-
-        install = to_verify(last.report)
-        if install is not None:
-            return hint(install, f"then: {command_text('verify', last.folder)}")
+        return hint(_verify_again(last, sources), "nothing was compared yet")
+    for line in _to_verify(last, sources):
+        return line
     from exporter.serve.site import NEEDED
 
     if NEEDED.keys() <= last.sizes.keys():

@@ -179,7 +179,7 @@ def _export_few(sources: Sequence[Path], job: ExportOptions, env: str | None, co
     told |= {"play": [p.to_dict() for p in played]} if played else {}
     console.json({"policies": [r.to_dict() for r in results], **told})
     console.write_reports(lambda: _entries(results, job.parity.steps, played))
-    console.next_step(results, job.compile.names, job.profile)
+    console.next_step(results, job.compile.names, job.profile, sources)
     status = 2 if refused else _status(results, played)
     if status:
         sys.exit(status)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from msgspec import Struct
@@ -15,16 +14,16 @@ from converters.formats.bundle.bundle import Bundle, unfit
 from converters.formats.bundle.embed import runnable
 from converters.formats.format import Format
 from converters.formats.programs.artifact import can_confine
-from converters.formats.registry import FROZEN_GRAPH, WRITTEN
+from converters.formats.registry import FROZEN_GRAPH, KERNELS, WRITTEN, own_reference
 from converters.formats.saved_model.writer import signatures_of
 from converters.formats.source import NO_NORMALISER, OriginalRun, ReadOptions
 from converters.graph.nodes import Graph, Node, TensorShape
-from converters.interfaces.isaac_lab import RAW_ACTION
 from converters.policy.policy import Policy
 from converters.runtimes.pool import RuntimePool, chosen_runtimes
-from exporter.export.job import Job, bake, own_in, runs_elsewhere
+from exporter.export.job import Job, own_in, runs_elsewhere
 from exporter.export.options import storage_of
 from exporter.export.pipeline import BEFORE_BAKE, UNDER_OWN_NAMES, Progress, consumer, join_reports
+from exporter.export.remade import baked_again, compiled_again, made_again, tensors
 from exporter.export.sources import Source, read_source
 from exporter.verify.checks.decisions import decisions
 from exporter.verify.options import VerifyOptions
@@ -34,18 +33,11 @@ from exporter.verify.report import ParityReport
 from exporter.verify.session import Session
 from exporter.verify.verification import verify
 from signatures.code import CodeOptions
-from signatures.contract import POLICY, Contract, safe_name
+from signatures.contract import POLICY, Contract
 from signatures.errors import BundleError, RuntimeUnavailableError, UsageError, naming
 from signatures.fields import printable
-from signatures.interface import Quantity
 from signatures.roles import Role
 from signatures.spec import PolicySignature
-
-#: The runtime that is our own kernels in numpy.
-KERNELS = "numpy"
-
-if TYPE_CHECKING:
-    from converters.consumers.profile import Profile
 
 
 class _Given(Struct, frozen=True):
@@ -150,11 +142,14 @@ def _unless_unverified(report: ParityReport, case: _Case, *, required: bool) -> 
             "reader were verified",
         )
     if required and not report.undecided:
+        from exporter.reports.summary import to_verify
+
+        install = to_verify(report) or "export-model runtimes says how to install one"
         raise RuntimeUnavailableError(
             "no independent runtime is installed, so nothing was verified",
             where=str(case.bundle.folder),
             why="only the numpy reference ran",
-            fix="pip install export-model[onnxruntime] (or [tensorflow]), or --allow-unverified",
+            fix=f"{install}, or --allow-unverified",
         )
     return report
 
@@ -163,21 +158,22 @@ def _evidence_of(found: Bundle, read: Source) -> _Given:
     """What the source says of a bundle. Raises BundleError where it is another, or means something else."""
     contract, made_for = found.contract, found.contract.tool.get("profile")
     if contract.tool.get("bake") is not None:
-        return _Given(read, again=_baked_again(read, contract))
+        return _Given(read, again=baked_again(read, contract))
     if made_for is None:
         original = _original_of(read, contract)
         _check_meaning(read, contract, found.folder)
-        return _Given(read, original)
+        judged = own_reference([f.key for f in WRITTEN.values() if found.has(f)])
+        return _Given(read, original, compiled_again(read, contract) if judged is None else None)
     wanted = consumer(made_for)
     if wanted.own_names.isdisjoint(f.key for f in WRITTEN.values() if found.has(f)):
         # Names of a consumer are not those of the source: what it was made from is dressed anew, and held against it.
-        return _Given(read, again=_made_again(read, contract, wanted))
+        return _Given(read, again=made_again(read, contract, wanted))
     return _Given(read, _original_of(read, contract))
 
 
 def _case(found: Bundle, given: _Given) -> _Case:
     formats = [f for f in WRITTEN.values() if found.has(f)]
-    judge = next((f for f in formats if KERNELS in f.runtimes), None)
+    judge = own_reference([f.key for f in formats])
     made_for = found.contract.tool.get("profile")
     programs = [] if can_confine() else [f.key for f in formats if f.program]
     return _Case(
@@ -350,7 +346,7 @@ def _check_meaning(found: Source, contract: Contract, folder: Path) -> None:
     """
     with naming(found.path):
         signatures = [p.signature for _, p in found.compile_models()]
-    alike = [s for s in signatures if _tensors(s) == _tensors(contract.signature)]
+    alike = [s for s in signatures if tensors(s) == tensors(contract.signature)]
     wrong = [[what for what, ours, its in _meanings(contract.signature, s) if ours != its] for s in alike]
     if wrong and all(wrong):
         what = f"says otherwise of {', '.join(wrong[0])} than its source"
@@ -369,50 +365,3 @@ def _meanings(ours: PolicySignature, its: PolicySignature) -> list[tuple[str, ob
         ),
         *((f"{a.name}'s source", a.source, b.source) for a, b in zip(ours.outputs, its.outputs, strict=True)),
     ]
-
-
-def _made_again(found: Source, contract: Contract, wanted: Profile) -> Job:
-    """A bundle's policy from its source, in the names of its consumer; raises BundleError where none is like it."""
-    compiled = list(found.compile_models())
-    named = [(m, p) for m, p in compiled if safe_name(p.name) == contract.name]
-    for model, own in named or compiled[: len(compiled) == 1]:
-        dressed = wanted.dress(own)
-        if _tensors(dressed.signature) == _tensors(contract.signature):
-            return Job(found, model, replace(dressed, name=contract.name), wanted, own)
-    raise BundleError(
-        "cannot be held against its source",
-        where=str(found.path),
-        why="the source gives other inputs and outputs than the bundle has: it was exported with options",
-        fix="leave --source out, or export it again",
-    )
-
-
-def _baked_again(found: Source, contract: Contract) -> Job:
-    """A bundle's policy from its source, its action baked anew by the bundle's interface.
-
-    Raises BundleError where none is like it. What a file beside the source stated is in the contract.
-    """
-    interface = contract.signature.interface
-    if interface is not None:
-        raw = tuple(
-            Quantity(name=t.name, source=t.source, clip=t.clip) for t in interface.baked if t.name == RAW_ACTION
-        )
-        by_name = {t.name: t for t in interface.baked}
-        actions = tuple(by_name.get(t.name, t) for t in interface.actions)
-        interface = replace(interface, baked=(), actions=actions, limits=(*raw, *interface.limits))
-    compiled = list(found.compile_models())
-    named = [(m, p) for m, p in compiled if safe_name(p.name) == contract.name]
-    for model, own in named or compiled[: len(compiled) == 1]:
-        if _tensors(own.signature) == _tensors(contract.signature):
-            policy = replace(own, name=contract.name, signature=replace(own.signature, interface=interface))
-            return bake(Job(found, model, policy), contract.tool["bake"])
-    raise BundleError(
-        "cannot be held against its source",
-        where=str(found.path),
-        why="the source gives other inputs and outputs than the bundle has: it was exported with options",
-        fix="leave --source out, or export it again",
-    )
-
-
-def _tensors(signature: PolicySignature) -> list[tuple[object, ...]]:
-    return [(s.name, s.role, s.dtype, s.shape) for s in (*signature.inputs, *signature.outputs)]

@@ -185,7 +185,7 @@ def own_in(job: Job, formats: Sequence[Format], folder: Path) -> PolicyUnderTest
     It is written in those of the formats that hold every policy; one of a consumer alone holds its names and no others.
     """
     assert job.own is not None
-    job = replace(job, policy=job.own, own=None, profile=None, batch=None, bake=None)
+    job = replace(job, policy=job.own, own=None, whole=None, profile=None, batch=None, bake=None)
     contract = contract_of(job.policy, job.source, job.model, ReadOptions())
     artifacts = [f.artifact(job.policy, WriteOptions(contract.compact())) for f in formats if f.default]
     for artifact in artifacts:
@@ -201,7 +201,7 @@ def check_weights(options: ExportOptions, formats: Sequence[Format]) -> None:
     if options.profile is not None:
         raise UsageError(
             f"{flag} does not go with --for {options.profile}",
-            why="the importers of Unity and TensorFlowSharp were not shown to read weights in less than float32",
+            why=f"{options.profile} was not shown to read weights in less than float32",
             fix="leave one of them out",
         )
     wide = [f.key for f in formats if not f.narrow]

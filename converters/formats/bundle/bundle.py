@@ -146,7 +146,7 @@ class Bundle(Struct, frozen=True):
                 "has no .bytes",
                 where=str(self.folder),
                 why="it is the graph that this tool reads and runs by itself",
-                fix=f"{_AGAIN} with bytes among --to",
+                fix=f"give what it was made from: --source {self.contract.origin.path}; or {_AGAIN}, with --to bytes,…",
             )
         return self.folder / relative
 

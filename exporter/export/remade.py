@@ -1,0 +1,105 @@
+"""A bundle's policy, made from its source once more: what the bundle's files are held against."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import product
+from typing import TYPE_CHECKING, get_args
+
+from msgspec.structs import replace
+
+from converters.compiler.options import CompileOptions, NoiseMode
+from converters.formats.source import SourceModel
+from converters.interfaces.isaac_lab import RAW_ACTION
+from converters.policy.policy import Policy
+from exporter.export.job import Job, bake, smaller
+from exporter.export.options import storage_of
+from exporter.export.sources import Source
+from signatures.contract import Contract, safe_name
+from signatures.errors import BundleError
+from signatures.interface import Quantity
+from signatures.spec import PolicySignature, SourceMap
+
+if TYPE_CHECKING:
+    from converters.consumers.profile import Profile
+
+
+def made_again(found: Source, contract: Contract, wanted: Profile) -> Job:
+    """A bundle's policy from its source, in the names of its consumer; raises BundleError where none is like it."""
+    for model, own in _compiled(found, contract):
+        dressed = wanted.dress(own)
+        if _alike(dressed, contract):
+            return Job(found, model, replace(dressed, name=contract.name), wanted, own)
+    raise _not_like_its_source(found, "leave --source out, or export it again")
+
+
+def baked_again(found: Source, contract: Contract) -> Job:
+    """A bundle's policy from its source, its action baked anew by the bundle's interface.
+
+    Raises BundleError where none is like it. What a file beside the source stated is in the contract.
+    """
+    interface = contract.signature.interface
+    if interface is not None:
+        raw = tuple(
+            Quantity(name=t.name, source=t.source, clip=t.clip) for t in interface.baked if t.name == RAW_ACTION
+        )
+        by_name = {t.name: t for t in interface.baked}
+        actions = tuple(by_name.get(t.name, t) for t in interface.actions)
+        interface = replace(interface, baked=(), actions=actions, limits=(*raw, *interface.limits))
+    for model, own in _compiled(found, contract):
+        if _alike(own, contract):
+            policy = replace(own, name=contract.name, signature=replace(own.signature, interface=interface))
+            return _rounded(bake(Job(found, model, policy), contract.tool["bake"]), contract)
+    raise _not_like_its_source(found, "leave --source out, or export it again")
+
+
+def compiled_again(found: Source, contract: Contract) -> Job:
+    """The policy of a bundle that has no file which the kernels run, from its source; raises BundleError as above."""
+    for model, own in _compiled(found, contract):
+        if _alike(own, contract):
+            return _rounded(Job(found, model, replace(own, name=contract.name)), contract)
+    raise _not_like_its_source(found, "export it again with bytes among --to")
+
+
+def _compiled(found: Source, contract: Contract) -> Iterator[tuple[SourceModel, Policy]]:
+    """The source's policies of the bundle's name, or its only one, by each choice of names, noise and chance: a
+    contract does not keep these, but what follows from them.
+    """
+    for names, noise, deterministic in product(("canonical", "source"), get_args(NoiseMode), (False, True)):
+        compiled = list(found.compile_models(CompileOptions(names=names, noise=noise, deterministic=deterministic)))
+        named = [(m, p) for m, p in compiled if safe_name(p.name) == contract.name]
+        yield from named or compiled[: len(compiled) == 1]
+
+
+def _alike(policy: Policy, contract: Contract) -> bool:
+    """Whether a policy has the contract's inputs and outputs, made from the same tensors, and draws where it does."""
+    return tensors(policy.signature) == tensors(contract.signature) and _origins(
+        policy.signature, policy.source
+    ) == _origins(contract.signature, contract.source)
+
+
+def _rounded(job: Job, contract: Contract) -> Job:
+    """A job with its weights stored as those of the bundle are."""
+    weights = contract.tool.get("weights")
+    return smaller(job, storage_of(weights)) if weights else job
+
+
+def _origins(signature: PolicySignature, source: SourceMap) -> tuple[object, ...]:
+    """What of the source a policy's tensors come from, and which chance is left in them."""
+    made_from = [spec.source for spec in (*signature.inputs, *signature.outputs)]
+    fixed = {name: value.tolist() for name, value in source.fixed.items()}
+    return made_from, fixed, {**source.noise}, source.noise_kept, source.branches
+
+
+def _not_like_its_source(found: Source, fix: str) -> BundleError:
+    return BundleError(
+        "cannot be held against its source",
+        where=str(found.path),
+        why="the source gives other inputs and outputs than the bundle has: it was exported with options",
+        fix=fix,
+    )
+
+
+def tensors(signature: PolicySignature) -> list[tuple[object, ...]]:
+    """What a caller sees of a policy's inputs and outputs."""
+    return [(s.name, s.role, s.dtype, s.shape) for s in (*signature.inputs, *signature.outputs)]
