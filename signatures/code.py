@@ -53,5 +53,7 @@ def code_options(
         if getattr(options, key) not in words:
             raise UsageError(f"--{key} {getattr(options, key)}: must be {' or '.join(words)}")
     if guard is not None and not (numbers.isfinite(guard) and guard > 0):
-        raise UsageError(f"--guard {guard:g}", fix="give a number of standard deviations, such as 6")
+        raise UsageError(
+            f"--guard {guard:g}: must be more than 0, and finite", why="it counts deviations", fix="such as 6"
+        )
     return options

@@ -206,8 +206,12 @@ def _chosen_brains(brains: tuple[Brain, ...], wanted: str | None) -> tuple[Brain
         return brains
     chosen = tuple(b for b in brains if b.label == wanted)
     if not chosen:
-        names = ", ".join(b.label or "(no scope)" for b in brains)
-        raise UsageError(f"--brain {wanted}: unknown brain", fix=f"this graph has: {names}")
+        names = [b.label for b in brains if b.label]
+        raise UsageError(
+            f"--brain {wanted}: unknown brain",
+            why=None if names else "the policy of this file has no name of its own",
+            fix=f"this graph has: {', '.join(names)}" if names else "leave --brain out",
+        )
     return chosen
 
 

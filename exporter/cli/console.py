@@ -51,8 +51,9 @@ class Console(Struct, frozen=True):
             return
         if not verifies:
             asked = {"--junit": self.junit, "--markdown": self.markdown, "--html": self.html}
+            given = [option for option, value in asked.items() if value is not None]
             raise UsageError(
-                f"{', '.join(option for option, given in asked.items() if given is not None)} needs a verification",
+                f"{', '.join(given)} {'needs' if len(given) == 1 else 'need'} a verification",
                 why="--verify none was given",
                 fix="leave one of them out",
             )

@@ -22,15 +22,33 @@ def check_log_of(
     from exporter.acting.loading import load_policy
     from exporter.logs.check import check_log
     from exporter.logs.judging import LOG_TOLERANCE
+    from exporter.verify.options import VerifyOptions
     from exporter.verify.tolerances import Tolerance
 
     if len(bundles) != 1:
         raise UsageError(f"--log goes with one policy, and {len(bundles)} were given", fix="verify them one by one")
-    if source is not None or console.junit is not None or console.markdown is not None:
-        raise UsageError("--log goes without --source, --junit and --markdown", fix="use --json or --html FILE")
-    default = Tolerance()
-    given = options.tolerance
-    tolerance = LOG_TOLERANCE if (given.atol, given.rtol) == (default.atol, default.rtol) else given
+    usual, default = VerifyOptions(), Tolerance()
+    unheard = {
+        "--source": source,
+        "--junit": console.junit,
+        "--markdown": console.markdown,
+        "--golden": options.golden,
+        "--max-size": options.budget,
+        "--require": options.require,
+        "--tolerances": options.rules,
+        "--samples": options.samples != usual.samples,
+        "--steps": options.steps != usual.steps,
+        "--seed": options.seed != usual.seed,
+    }
+    for flag, given in unheard.items():
+        if given:
+            raise UsageError(
+                f"{flag} does not go with --log",
+                why="a log's own steps are computed again, and nothing else",
+                fix="leave one of them out; --json and --html FILE write what was found",
+            )
+    wanted = options.tolerance
+    tolerance = LOG_TOLERANCE if (wanted.atol, wanted.rtol) == (default.atol, default.rtol) else wanted
     with console.progress() as progress:
         progress("computing the steps again")
         report = check_log(load_policy(bundles[0]), log, tolerance)

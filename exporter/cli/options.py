@@ -212,7 +212,7 @@ def coding(command: Callable[..., Any]) -> Callable[..., Any]:
     return parse_and_call
 
 
-def _required_formats(given: str | None, *, unverified: bool) -> tuple[str, ...]:
+def _required_formats(given: str | None, *, unverified: str | None) -> tuple[str, ...]:
     """Return the formats of ``--require``. Raises UsageError."""
     if given is None:
         return ()
@@ -225,8 +225,10 @@ def _required_formats(given: str | None, *, unverified: bool) -> tuple[str, ...]
             f"--require {given}: must name formats",
             fix=f"{suggestion(wrong or '', WRITTEN)}all, or {', '.join(WRITTEN)}",
         )
-    if unverified:
-        raise UsageError(f"--require {given} needs a verification", fix="leave --allow-unverified or --verify none out")
+    if unverified is not None:
+        raise UsageError(
+            f"--require {given} needs a verification", why=f"{unverified} was given", fix="leave one of them out"
+        )
     return wanted
 
 
@@ -252,9 +254,10 @@ def comparing(command: Callable[..., Any]) -> Callable[..., Any]:
         from exporter.verify.tolerances import Tolerance
 
         tolerance = Tolerance(atol, rtol)
-        require = _required_formats(
-            required, unverified=bool(rest.get("allow_unverified")) or rest.get("runtimes") == "none"
-        )
+        unverified = "--allow-unverified" if rest.get("allow_unverified") else None
+        if rest.get("runtimes") == "none":
+            unverified = "--verify none"
+        require = _required_formats(required, unverified=unverified)
         options = VerifyOptions(
             seed=seed,
             samples=samples,

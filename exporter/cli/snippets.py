@@ -49,4 +49,4 @@ def snippets_command(bundle: Path | None, target: str | None, as_json: bool) -> 
         say()
         say_lines(snippet.code)
     for name, needed in lacking.items():
-        say(f"left out: {name} needs {needed}, which is not in this bundle")
+        say(f"left out: {name} needs {needed}, which this bundle lacks")

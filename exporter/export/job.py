@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from converters.compiler.passes.weights import Storage, round_weights
 from converters.formats.bundle.embed import FIXED_BATCH
 from converters.formats.format import Artifact, Format, WriteOptions
-from converters.formats.registry import WRITTEN
+from converters.formats.registry import ONNX, WRITTEN
 from converters.formats.source import ReadOptions, SourceModel
 from converters.policy.policy import Policy
 from exporter import __version__
@@ -241,10 +241,25 @@ def check_code(options: ExportOptions, formats: Sequence[Format]) -> None:
     said = options.code.to_dict()
     if said and not any(f.program for f in formats):
         (key, value), *_ = said.items()
+        what = f"--to {','.join(f.key for f in formats)}" if options.profile is None else f"--for {options.profile}"
         raise UsageError(
-            f"--{key} {value} does not go with --to {','.join(f.key for f in formats)}",
+            f"--{key} {value:g} does not go with {what}"
+            if isinstance(value, float)
+            else f"--{key} {value} does not go with {what}",
             why="it says how source code is written",
-            fix=f"add a format to --to: {', '.join(f.key for f in WRITTEN.values() if f.program)}",
+            fix=f"add a format to --to: {', '.join(f.key for f in WRITTEN.values() if f.program)}"
+            if options.profile is None
+            else "leave one of them out",
+        )
+
+
+def check_opset(options: ExportOptions, formats: Sequence[Format]) -> None:
+    """Raise UsageError where an opset is asked for and no format has one."""
+    if options.opset is not None and ONNX not in formats:
+        raise UsageError(
+            f"--opset {options.opset} does not go with --to {','.join(f.key for f in formats)}",
+            why="it is the version of ONNX's operators",
+            fix="leave it out, or add onnx to --to",
         )
 
 

@@ -24,6 +24,7 @@ from exporter.export.job import (
     check_bake,
     check_batch,
     check_code,
+    check_opset,
     check_weights,
     fix_batch,
     own_in,
@@ -40,6 +41,7 @@ from exporter.remote.filesystem import remote
 from exporter.remote.sending import check_free, check_sendable, landing
 from exporter.tables import count_text
 from exporter.verify.checks.size import check_budget
+from exporter.verify.options import VerifyOptions
 from exporter.verify.tolerances import check_rules
 from signatures.contract import PARITY, Contract, safe_name
 from signatures.errors import (
@@ -126,6 +128,7 @@ class Exporter:
         check_weights(options, self._formats)
         check_batch(options, self._formats)
         check_code(options, self._formats)
+        check_opset(options, self._formats)
         check_bake(options)
         self._profile = wanted
         #: None where the writers of its formats give a policy the consumer's names
@@ -327,7 +330,16 @@ def consumer(name: str) -> Profile:
 def _check_parity(options: ExportOptions, formats: Sequence[Format]) -> None:
     """What decides whether a policy passed is there, and is asked. Raises UsageError."""
     parity = options.parity
-    deciding = {"--golden": parity.golden, "--max-size": parity.budget, "--tolerances": parity.rules}
+    usual = VerifyOptions()
+    deciding = {
+        "--golden": parity.golden,
+        "--max-size": parity.budget,
+        "--tolerances": parity.rules,
+        "--samples": parity.samples != usual.samples,
+        "--steps": parity.steps != usual.steps,
+        "--atol": parity.tolerance.atol != usual.tolerance.atol,
+        "--rtol": parity.tolerance.rtol != usual.tolerance.rtol,
+    }
     given = [flag for flag, value in deciding.items() if value]
     if options.verify == "none" and given:
         raise UsageError(f"{given[0]} needs a verification", why="--verify none was given", fix="leave one of them out")

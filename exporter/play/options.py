@@ -25,9 +25,9 @@ class PlayOptions(Struct, frozen=True):
     most: int = 12_800
 
     def __post_init__(self) -> None:
-        force_setattr(self, "episodes", whole("episodes", self.episodes, LEAST_EPISODES, MOST_EPISODES))
-        force_setattr(self, "seed", whole("seed", self.seed, 0, MAX_SEED))
-        force_setattr(self, "most", whole("most", self.most, 0, MOST_EPISODES))
+        force_setattr(self, "episodes", whole("--episodes", self.episodes, LEAST_EPISODES, MOST_EPISODES))
+        force_setattr(self, "seed", whole("--seed", self.seed, 0, MAX_SEED))
+        force_setattr(self, "most", whole("--most", self.most, 0, MOST_EPISODES))
         parse_margin(self.margin)
 
     @property

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from functools import partial
 from string import Template
 from typing import Any
@@ -35,7 +35,11 @@ class Target(Struct, frozen=True):
     @property
     def formats_text(self) -> str:
         """The formats that it needs, for people."""
-        return " or ".join(map(" and ".join, self.alternatives))
+        return self.lacking_text(frozenset())
+
+    def lacking_text(self, has: Collection[str]) -> str:
+        """Those of its formats that a bundle lacks."""
+        return " or ".join(" and ".join(key for key in keys if key not in has) for keys in self.alternatives)
 
 
 def _javascript(
@@ -131,11 +135,11 @@ def snippets(bundle: Bundle, name: str | None = None) -> tuple[list[Snippet], di
         raise UsageError(f"--for {name}: unknown target", fix=f"one of: help, {', '.join(t.name for t in TARGETS)}")
     has = {key for key, found in WRITTEN.items() if found.first_file_of(bundle.name) in bundle.files}
     able = {t.name for t in chosen if any(has.issuperset(keys) for keys in t.alternatives)}
-    lacking = {t.name: t.formats_text for t in chosen if t.name not in able}
+    lacking = {t.name: t.lacking_text(has) for t in chosen if t.name not in able}
     if len(lacking) == len(chosen):
         needed = next(iter(lacking.values()))
         raise BundleError(
-            f"has no {needed}, which {chosen[0].title} needs",
+            f"has no {needed}, which --for {chosen[0].name} needs",
             where=str(bundle.folder),
             fix="export the policy again with all formats (the default of --to)"
             if bundle.made_for is None

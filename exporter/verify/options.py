@@ -33,7 +33,7 @@ class VerifyOptions(Struct, frozen=True):
 
     def __post_init__(self) -> None:
         for name, value, least in (("seed", self.seed, 0), ("samples", self.samples, 1), ("steps", self.steps, 1)):
-            force_setattr(self, name, whole(name, value, least))
+            force_setattr(self, name, whole(f"--{name}", value, least))
         for name, bound in (("atol", self.tolerance.atol), ("rtol", self.tolerance.rtol)):
             if not math.isfinite(bound) or bound < 0:
-                raise UsageError(f"{name} is {bound}", fix="give a number that is not negative")
+                raise UsageError(f"--{name} {bound:g}: must be 0 or more, and finite", fix="leave it out: 1e-05")

@@ -16,12 +16,19 @@ from tests.commands import is_refused
 def test_what_a_bundle_has_not_is_left_out_or_refused(tmp_path: Path) -> None:
     (result,) = export_model(fixture("continuous"), tmp_path, to="bytes", verify="none")
     ran = run("snippets", result.folder)
-    assert "left out: onnxruntime needs onnx, which is not in this bundle" in ran.out
+    assert "left out: onnxruntime needs onnx, which this bundle lacks" in ran.out
     assert "left out: policy-ort needs tfjs and onnx" in ran.out
     assert "(--for tensorflowsharp)" in ran.out
-    is_refused(run("snippets", result.folder, "--for", "onnxruntime"), "has no onnx", "fix")
+    is_refused(
+        run("snippets", result.folder, "--for", "onnxruntime"), "has no onnx, which --for onnxruntime needs", "fix"
+    )
     is_refused(run("snippets", result.folder, "--for", "swift"), "unknown target", "onnxruntime")
     is_refused(run("snippets", tmp_path / "none"), "no such folder")
+
+
+def test_only_what_a_bundle_lacks_is_said_to_be_lacking(tmp_path: Path) -> None:
+    (result,) = export_model(fixture("continuous"), tmp_path, to="onnx", verify="none")
+    assert "left out: policy-ort needs tfjs, which this bundle lacks" in run("snippets", result.folder).out
 
 
 def test_a_recurrent_policy_with_the_nodes_of_its_trainer_runs_in_unity(tmp_path: Path) -> None:

@@ -42,7 +42,7 @@ def out(tmp_path: Path) -> Iterator[Path]:
         (["--to", "bytes,onnx,coreml"], ["--to coreml"]),
         (["--to", ""], ["--to names no format", "bytes, saved_model, tfjs, onnx"]),
         (["--to", ","], ["--to names no format"]),
-        (["--brain", "Ball"], ["--brain Ball", "(no scope)"]),
+        (["--brain", "Ball"], ["--brain Ball", "no name of its own"]),
         (["--input", "state"], ["--input state: NAME=VALUE is expected"]),
         (["--input", "=noise"], ["NAME=VALUE is expected"]),
         (["--input", "state=observations"], ["--input state=observations", "the roles are", "vector_observation"]),
@@ -64,12 +64,23 @@ def out(tmp_path: Path) -> Iterator[Path]:
         (["--verify", "tensorflo"], ["unknown runtime 'tensorflo'", "numpy, tensorflow"]),
         (["--verify", "onnxruntime,torch"], ["unknown runtime 'torch'"]),
         (["--seed", "-1"], ["seed -1: must be a whole number"]),
-        (["--atol", "nan"], ["atol is nan"]),
+        (["--atol", "nan"], ["--atol nan"]),
         (["--golden", "nowhere.npz"], ["--golden needs a verification", "--verify none"]),
         (["--max-size", "bytes=1B"], ["--max-size needs a verification"]),
         (["--jobs", "0"], ["--jobs 0: must be 1 or more"]),
-        (["--rtol", "inf"], ["rtol is inf"]),
-        (["--atol", "-1e-5"], ["atol is -1e-05"]),
+        (["--samples", "9"], ["--samples needs a verification"]),
+        (["--steps", "9"], ["--steps needs a verification"]),
+        (["--atol", "1"], ["--atol needs a verification"]),
+        (["--rtol", "1"], ["--rtol needs a verification"]),
+        (["--require", "onnx"], ["--require onnx needs a verification", "--verify none was given"]),
+        (["--html", "a.html"], ["--html needs a verification"]),
+        (["--html", "a.html", "--junit", "b.xml"], ["--junit, --html need a verification"]),
+        (["--to", "tfjs,bytes", "--opset", "18"], ["--opset 18 does not go with --to tfjs,bytes"]),
+        (["--to", "onnx", "--guard", "6"], ["--guard 6 does not go with --to onnx"]),
+        (["--for", "unity6", "--math", "own"], ["--math own does not go with --for unity6", "leave one of them out"]),
+        (["--for", "isaac-lab", "--quantize", "int8"], ["isaac-lab was not shown to read weights"]),
+        (["--rtol", "inf"], ["--rtol inf"]),
+        (["--atol", "-1e-5"], ["--atol -1e-05"]),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) and value[0].startswith("--") else "",
 )
@@ -158,7 +169,7 @@ def test_a_recording_that_is_not_there_is_said_before_anything_is_read(flags: tu
 
 def test_tolerances_are_finite_and_not_negative() -> None:
     for tolerance in (Tolerance(atol=float("inf")), Tolerance(rtol=-1.0), Tolerance(atol=float("nan"))):
-        with pytest.raises(UsageError, match="not negative"):
+        with pytest.raises(UsageError, match="must be 0 or more, and finite"):
             VerifyOptions(tolerance=tolerance)
     assert VerifyOptions(tolerance=Tolerance(0.0, 0.0)).tolerance.atol == 0
 

@@ -19,7 +19,7 @@ from exporter.acting.policy import LoadedPolicy
 from exporter.logs.reading import read_recording
 from exporter.logs.recording import NONE, links
 from signatures.errors import UsageError
-from tests.commands import ROOT, export_model
+from tests.commands import ROOT, export_model, is_refused
 from tests.logs.planting import Arrays
 from tests.reports.validation import closed, schema
 
@@ -156,3 +156,12 @@ def test_verify_explains_a_log(tmp_path: Path) -> None:
     Draft202012Validator(closed(schema("log"))).validate(printed)
     assert printed["causes"][0]["where"] == "state[1]"
     assert export_model("verify", source, "--log", wrong, "--source", source).status == 2
+    for unheard in (
+        ("--require", "onnx"),
+        ("--samples", "9"),
+        ("--golden", wrong),
+        ("--junit", "a.xml"),
+        ("--seed", "3"),
+    ):
+        ran = export_model("verify", source, "--log", wrong, *unheard)
+        is_refused(ran, f"{unheard[0]} does not go with --log")

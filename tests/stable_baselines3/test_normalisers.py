@@ -214,7 +214,8 @@ def test_what_is_not_a_normaliser_is_refused_and_nothing_in_it_is_run(tmp_path: 
         (pickle.dumps({"mean": 1}), "is not a VecNormalize"),
         (pickle.dumps(_Runs(touched)), "its pickle asks for"),
         (pickle.dumps([_Runs(touched), 1]), "its pickle asks for"),
-        (whole[: len(whole) // 2], "pickle"),
+        (whole[: len(whole) // 2], "vecnormalize.pkl: its pickle"),
+        (Path("fixtures/sb3/sb3_continuous.onnx").read_bytes(), "vecnormalize.pkl: its pickle"),
         ((NORMALISED / "ppo_mixed.pkl").read_bytes(), "normalises a Dict of observations, and the policy observes one"),
         (whole.replace(b"mean", b"main"), "is not an array of numbers"),
     ):

@@ -19,7 +19,7 @@ from converters.files.pickled_objects import Instance, array_of, unpickle_object
 from converters.graph.nn.activations import clip
 from converters.graph.types import FLOAT32
 from converters.trainers.pytorch.network import Network
-from signatures.errors import DamagedFileError, NotAPolicyError, SourceError
+from signatures.errors import DamagedFileError, NotAPolicyError, SourceError, naming
 from signatures.roles import Role
 
 _CLASS = "VecNormalize"
@@ -132,7 +132,8 @@ class Normaliser(Struct):
 
 def read_normaliser(name: str, data: bytes) -> Normaliser:
     """Return what a pickled ``VecNormalize`` says. Raises NotAPolicyError for another pickle, DamagedFileError."""
-    value = unpickle_objects(data)
+    with naming(name):
+        value = unpickle_objects(data)
     if not isinstance(value, Instance) or not _is_vecnormalize(value):
         what = f"an object of {value.maker.module[:60]}.{value.maker.name[:60]}" if isinstance(value, Instance) else ""
         raise NotAPolicyError(
