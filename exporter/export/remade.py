@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 def made_again(found: Source, contract: Contract, wanted: Profile) -> Job:
     """A bundle's policy from its source, in the names of its consumer; raises BundleError where none is like it."""
-    for model, own in _compiled(found, contract):
+    for model, own in _candidates(found, contract):
         dressed = wanted.dress(own)
         if _alike(dressed, contract):
             return Job(found, model, replace(dressed, name=contract.name), wanted, own)
@@ -46,22 +46,22 @@ def baked_again(found: Source, contract: Contract) -> Job:
         by_name = {t.name: t for t in interface.baked}
         actions = tuple(by_name.get(t.name, t) for t in interface.actions)
         interface = replace(interface, baked=(), actions=actions, limits=(*raw, *interface.limits))
-    for model, own in _compiled(found, contract):
+    for model, own in _candidates(found, contract):
         if _alike(own, contract):
             policy = replace(own, name=contract.name, signature=replace(own.signature, interface=interface))
-            return _rounded(bake(Job(found, model, policy), contract.tool["bake"]), contract)
+            return _round_like(bake(Job(found, model, policy), contract.tool["bake"]), contract)
     raise _not_like_its_source(found, "leave --source out, or export it again")
 
 
 def compiled_again(found: Source, contract: Contract) -> Job:
     """The policy of a bundle that has no file which the kernels run, from its source; raises BundleError as above."""
-    for model, own in _compiled(found, contract):
+    for model, own in _candidates(found, contract):
         if _alike(own, contract):
-            return _rounded(Job(found, model, replace(own, name=contract.name)), contract)
+            return _round_like(Job(found, model, replace(own, name=contract.name)), contract)
     raise _not_like_its_source(found, "export it again with bytes among --to")
 
 
-def _compiled(found: Source, contract: Contract) -> Iterator[tuple[SourceModel, Policy]]:
+def _candidates(found: Source, contract: Contract) -> Iterator[tuple[SourceModel, Policy]]:
     """The source's policies of the bundle's name, or its only one, by each choice of names, noise and chance: a
     contract does not keep these, but what follows from them.
     """
@@ -78,7 +78,7 @@ def _alike(policy: Policy, contract: Contract) -> bool:
     ) == _origins(contract.signature, contract.source)
 
 
-def _rounded(job: Job, contract: Contract) -> Job:
+def _round_like(job: Job, contract: Contract) -> Job:
     """A job with its weights stored as those of the bundle are."""
     weights = contract.tool.get("weights")
     return smaller(job, storage_of(weights)) if weights else job
