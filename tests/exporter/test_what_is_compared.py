@@ -190,12 +190,13 @@ def test_companions_are_what_follows_from_the_sources_own_numbers(
 def test_a_source_that_takes_some_rows_only_is_asked_in_parts(rows: int) -> None:
     """Old LSTM exports are right at batch 1 only."""
     signature = PolicySignature(
-        (
+        inputs=(
             TensorSpec("state", Role.VECTOR, "float32", (None, 3), "x:0"),
             TensorSpec("gain", Role.PARAMETER, "float32", (2,)),
         ),
-        (TensorSpec("action", Role.CONTINUOUS, "float32", (None, 3), "y:0"),),
-        *("own model", "continuous"),
+        outputs=(TensorSpec("action", Role.CONTINUOUS, "float32", (None, 3), "y:0"),),
+        family="own model",
+        action_space="continuous",
     )
     asked: list[int] = []
 
