@@ -19,6 +19,7 @@ NAMES = sorted(p.stem for p in FOLDER.glob("*.pt"))
 ATOL, RTOL = 2e-6, 2e-5
 #: What the code of a scripted module does not say.
 SENSORS = {"convolved_script": ((55,),), "seeing_script": ((1, 13, 16), (5,)), "chosen_script": ((10,),)}
+SENSORS |= {"painted_script": ((3, 12, 12),)}
 _MEMORY_IN, _MEMORY_OUT = "recurrent_in", "recurrent_out"
 
 

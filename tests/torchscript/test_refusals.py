@@ -141,3 +141,8 @@ def test_code_of_older_pytorch_gives_the_same(tmp_path: Path) -> None:
     (name,) = [s.name for s in policy.signature.inputs]
     made = run_graph(policy.graph, {name: given}, ["action"])["action"]
     assert made == pytest.approx(golden["out"][:, 0], abs=2e-6, rel=2e-5)
+
+
+def test_a_scripted_camera_asks_for_its_shape() -> None:
+    with pytest.raises(UnsupportedOpError, match="--sensors 3x84x84"):
+        read_source(FOLDER / "painted_script.pt").policies()

@@ -161,7 +161,9 @@ class Interpreter:
             case ast.Constant(value=bool() | int() | float() | str() | None as value):
                 return value
             case ast.Name(id=name):
-                return frame.names[name] if name in frame.names else Named(name)
+                if name in frame.names:
+                    return frame.names[name]
+                return float(name) if name in ("inf", "nan") else Named(name)
             case ast.Attribute(value=owner, attr=name):
                 return self.attribute_of(self.value_of(owner, frame), name)
             case ast.Tuple(elts=parts):

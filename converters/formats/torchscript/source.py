@@ -27,7 +27,7 @@ from converters.formats.torchscript.values import LengthFoundError, Module, Tens
 from converters.graph.types import FLOAT32
 from converters.policy.facts import DOUBLES_NARROWED, SourceFacts
 from converters.policy.memories import part_of, stem_of
-from signatures.errors import NotAPolicyError, SourceError, UsageError
+from signatures.errors import NotAPolicyError, SourceError, UnsupportedOpError, UsageError
 from signatures.roles import Role
 
 _MAX_INPUTS, _MAX_AXES = 16, 5
@@ -72,6 +72,13 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
             known = tuple(found.length if i == axis else d for i, d in enumerate(inputs[number].shape))
             inputs[number] = replace(inputs[number], shape=known)
             continue
+        except UnsupportedOpError as error:
+            if archive.traced or options.sensors:
+                raise
+            fix = (
+                f"where it observes more than a row of numbers, say so: --sensors 3x84x84 (one per input); {error.fix}"
+            )
+            raise UnsupportedOpError(error.what, why=error.why, fix=fix, issues=error.issues) from error
         outputs = _outputs(result)
         found_states = {x.name: _lengths_of(x.shape) for x in _states(machine, inputs, outputs) if x.name not in memory}
         written = machine.written_buffers()

@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any
 
 from converters.formats.torchscript.machine import Machine, unknown_length
-from converters.formats.torchscript.ops.scalars import NUMBERS
+from converters.formats.torchscript.ops.scalars import NUMBERS, join_lists
 from converters.formats.torchscript.values import LengthFoundError, OpenLength, Tensor
 from converters.graph.nn import activations, trigonometry
 from converters.graph.nn.activations import Activation
@@ -68,6 +68,8 @@ def _with_factor(op: str, name: str, *, swapped: bool = False) -> Callable[..., 
     """``add(a, b, alpha)``: a + alpha·b."""
 
     def translate(m: Machine, a: Any, b: Any, alpha: Any = 1) -> Any:
+        if isinstance(a, list) and isinstance(b, list) and name == "add":
+            return join_lists(a, b)
         if not _tensors(a, b):
             return _numbers(m, name, *((b, a) if swapped else (a, b)))
         if swapped:
@@ -99,6 +101,14 @@ def _divide(m: Machine, a: Any, b: Any, rounding_mode: Any = None) -> Any:
 def _towards_zero(m: Machine, x: str) -> str:
     """Cut off what is behind the point."""
     return m.b.add("Mul", [m.b.add("Sign", [x]), m.b.add("Floor", [m.b.add("Abs", [x])])])
+
+
+def _remainder(m: Machine, a: Any, b: Any) -> Any:
+    """With the sign of the divisor."""
+    if not _tensors(a, b):
+        return m.number(a % b)
+    left, right = m.pair(a, b)
+    return Tensor(m.b.add("FloorMod", [left, right]))
 
 
 def _floor_divided(m: Machine, a: Any, b: Any) -> Any:
@@ -297,6 +307,7 @@ OPS: Mapping[str, Callable[..., Any]] = {
     },
     "true_divide": _divide,
     "floor_divide": _floor_divided,
+    "remainder": _remainder,
     "pow": _power,
     "maximum": lambda m, a, b: Tensor(m.b.add("Maximum", list(m.pair(a, b)))),
     "minimum": lambda m, a, b: Tensor(m.b.add("Minimum", list(m.pair(a, b)))),

@@ -63,6 +63,13 @@ def _append(m: Machine, items: list[Any], value: Any) -> list[Any]:
     return items
 
 
+def join_lists(a: list[Any], b: list[Any]) -> list[Any]:
+    """Return one list of both. Raises UnsupportedOpError where it grows without end."""
+    if len(a) + len(b) > _MAX_RANGE or any(isinstance(item, list | tuple) for item in (*a, *b)):
+        raise UnsupportedOpError("lists grow in a list", why="lists of tensors and numbers are known")
+    return [*a, *b]
+
+
 def dtype_of(code: Any) -> Any:
     """Return numpy's dtype of a number that a program calls one by. Raises UnsupportedOpError."""
     if code not in DTYPES:
@@ -80,6 +87,10 @@ OPS: Mapping[str, Callable[..., Any]] = {
     "ops.prim.device": lambda m, value: Device(),
     "ops.prim.layout": lambda m, value: None,
     "ops.prim.RaiseException": _raise,
+    "ops.prim.is_nested": lambda m, value: False,
+    **dict.fromkeys(("is_autocast_enabled", "is_autocast_cpu_enabled", "is_grad_enabled"), lambda m, *given: False),
+    "__derive_index": lambda m, index, start, step: m.number(start + index * step),
+    "__range_length": lambda m, *bounds: len(_range(m, *bounds)),
     "ops.prim.min": lambda m, *given: min(*given),
     "ops.prim.max": lambda m, *given: max(*given),
     "device": lambda m, *given: Device(),
