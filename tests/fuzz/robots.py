@@ -63,6 +63,23 @@ def change_run(files: Files, random: Random) -> Files:
     return {**files, name: changed}
 
 
+def modules() -> list[Files]:
+    """Return modules that RLlib saved."""
+    found = []
+    for state in sorted(FOLDER.glob("rllib_*.state.pkl")):
+        arguments = state.with_name(state.name.replace(".state.", ".arguments."))
+        found.append({"module_state.pkl": state.read_bytes(), "class_and_ctor_args.pkl": arguments.read_bytes()})
+    return found
+
+
+def change_module(files: Files, random: Random) -> Files:
+    """Change one of the two pickles by its opcodes, or its bytes."""
+    name = random.choice(sorted(files))
+    if random.random() < 0.8:
+        return {**files, name: mutation.parts(changes.opcodes(files[name]), random, changes.opcode)}
+    return {**files, name: mutation.damaged(files[name], random)}
+
+
 def saved_policies() -> list[Files]:
     """Return models that SBX saved."""
     return [{"policy.zip": f.read_bytes()} for f in sorted(FOLDER.glob("sbx_*.zip"))]
