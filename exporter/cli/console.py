@@ -291,7 +291,11 @@ def _next(results: Sequence[ExportResult], sources: Sequence[Path]) -> str:
 
     if NEEDED.keys() <= last.sizes.keys():
         return hint(command_text("serve", last.folder), "see it act, in a browser")
-    return hint(command_text("snippets", last.folder), "code for Python, JavaScript, C#, Unity, TF Serving")
+    from exporter.snippets.registry import languages
+
+    if not (said := languages(last.sizes)):
+        return hint(_verify_again(last, sources), "in a job, whenever it may have changed")
+    return hint(command_text("snippets", last.folder), f"code for {said}")
 
 
 def reporting(command: Callable[..., Any]) -> Callable[..., Any]:

@@ -90,6 +90,16 @@ def _fill_code(found: Format, code: Code, bundle: Bundle) -> str:
     return Template(code.text).substitute(path=string_literal(bundle.path(found.main_of(bundle.name))))
 
 
+#: What people call the language of a snippet.
+_CALLED = {
+    "python": "Python",
+    "html": "web pages",
+    "js": "Node",
+    "csharp": "C# (Unity)",
+    "gdscript": "Godot",
+    "sh": "TF Serving",
+    "text": "Unity's Inspector",
+}
 #: What writes a log needs no file of the policy.
 _ANY = tuple(WRITTEN.values())
 TARGETS += (
@@ -105,6 +115,12 @@ TARGETS += tuple(
     for found in WRITTEN.values()
     for code in found.snippets
 )
+
+
+def languages(keys: Collection[str]) -> str:
+    """What there is code for that calls a bundle of these formats; nothing where there is none."""
+    callers = [t for t in TARGETS if t.needs != _ANY and any(set(keys).issuperset(need) for need in t.alternatives)]
+    return ", ".join(dict.fromkeys(_CALLED[t.language] for t in callers))
 
 
 class Snippet(Struct, frozen=True):

@@ -32,9 +32,9 @@ def export_all(folder: Path) -> Path:
     """All fixtures as bundles, one with labels, one with the trainer's own names."""
     for kind in KINDS:
         labels = {"actions": ["roll </script>", "pitch"]} if kind == "continuous" else None
-        options = ExportOptions(folder, (*DEFAULTS, "csharp"), verify="none", labels=labels)
+        options = ExportOptions(folder, (*DEFAULTS, "csharp", "litert"), verify="none", labels=labels)
         list(export([fixture(kind)], options))
     renamed = folder / "own-names.bytes"
     shutil.copy(fixture("twobrains"), renamed)
-    export_model(renamed, folder, to=(*DEFAULTS, "csharp"), names="source", verify="none")
+    export_model(renamed, folder, to=(*DEFAULTS, "csharp", "litert"), names="source", verify="none")
     return folder

@@ -257,7 +257,7 @@ def test_every_kind_of_public_policy_has_snippets(kind: str, tmp_path: Path) -> 
     rendered = 0
     for number, file in enumerate(files[:: max(1, len(files) // 12)]):
         try:
-            to = (*DEFAULTS, "csharp")
+            to = (*DEFAULTS, "csharp", "litert")
             results = list(export([file], ExportOptions(tmp_path / str(number), to, verify="none")))
         except ExportModelError:
             continue

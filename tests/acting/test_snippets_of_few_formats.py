@@ -5,6 +5,9 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import numpy as np
+import pytest
+
 from exporter import export_model
 from exporter.snippets.contract import class_name, identifier, read_bundle, wrap_items
 from exporter.snippets.registry import snippets
@@ -24,6 +27,34 @@ def test_what_a_bundle_has_not_is_left_out_or_refused(tmp_path: Path) -> None:
     )
     is_refused(run("snippets", result.folder, "--for", "swift"), "unknown target", "onnxruntime")
     is_refused(run("snippets", tmp_path / "none"), "no such folder")
+
+
+@pytest.mark.parametrize("policy", ["continuous", "recurrent"])
+def test_the_snippet_for_litert_answers_what_onnxruntime_does(policy: str, tmp_path: Path) -> None:
+    pytest.importorskip("ai_edge_litert")
+    onnxruntime = pytest.importorskip("onnxruntime")
+    (result,) = export_model(fixture(policy), tmp_path, to=["litert", "onnx"], verify="none")
+    said: dict[str, np.ndarray] = {}
+    exec(run("snippets", result.folder, "--for", "litert").out, {"print": said.__setitem__})
+    session = onnxruntime.InferenceSession(result.folder / f"{policy}.onnx")
+    kinds = {"tensor(float)": np.float32, "tensor(int32)": np.int32}
+    feeds = {
+        i.name: np.full([n if isinstance(n, int) else 1 for n in i.shape], "mask" in i.name, kinds[i.type])
+        for i in session.get_inputs()
+    }
+    wanted = dict(zip([o.name for o in session.get_outputs()], session.run(None, feeds), strict=True))
+    assert said.keys() == wanted.keys()
+    for name, value in said.items():
+        np.testing.assert_allclose(value, wanted[name], rtol=1e-5, atol=1e-5, err_msg=name)
+
+
+@pytest.mark.parametrize("to", ["c", "js", "c,js", "csharp", "litert", "nn", "onnx", "bytes"])
+def test_the_next_line_leads_to_code_only_where_there_is_some(to: str, tmp_path: Path) -> None:
+    ran = run(fixture("continuous"), "-o", tmp_path, "--to", to, "--verify", "numpy")
+    line = ran.out.strip().splitlines()[-1]
+    made, _ = snippets(read_bundle(tmp_path / "continuous"))
+    calling = {s.target.name for s in made if not s.target.name.startswith("recorder")}
+    assert ("export-model snippets" in line) is bool(calling) or "pip install" in line or "runtimes install" in line
 
 
 def test_only_what_a_bundle_lacks_is_said_to_be_lacking(tmp_path: Path) -> None:

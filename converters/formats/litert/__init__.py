@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from converters.formats.format import Format, defer_imports
+from converters.formats.format import Code, Format, defer_imports
 
 if TYPE_CHECKING:
     from converters.formats.litert import artifact as _artifact
@@ -12,6 +12,21 @@ if TYPE_CHECKING:
     from converters.formats.litert import writer as _writer
 else:
     _artifact, _source, _writer = defer_imports(__name__, "artifact", "source", "writer")
+
+_PYTHON = """\
+# pip install ai-edge-litert; Kotlin, Swift and pages call the same signature, by the same names
+import numpy as np
+from ai_edge_litert.interpreter import Interpreter
+
+policy = Interpreter($path).get_signature_runner("serving_default")
+# one agent (-1: any number of them); a mask's 1 allows an action; a memory's output is its input at the next step
+feeds = {
+    name: np.full([max(n, 1) for n in port["shape_signature"]], "mask" in name, port["dtype"])
+    for name, port in policy.get_input_details().items()
+}
+for name, value in policy(**feeds).items():
+    print(name, value)
+"""
 
 FORMATS = (
     Format(
@@ -30,5 +45,6 @@ FORMATS = (
         runtimes=("litert", "litert-plain", "litert-web"),
         signatures=True,
         dtypes=frozenset(("float32", "int32", "bool", "uint8")),
+        snippets=(Code("litert", "Python, LiteRT", "python", _PYTHON),),
     ),
 )
