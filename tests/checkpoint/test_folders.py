@@ -51,6 +51,17 @@ def of(prefix: str) -> list[str]:
 # ------------------------------------------------------------------ the layouts of ML-Agents
 
 
+def test_exports_in_folders_beside_are_told_once(tmp_path: Path) -> None:
+    for name in ("A.bytes", "B.bytes", "sub/C.bytes", "notes/readme.txt"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        frozen(tmp_path / name)
+    (tmp_path / "notes/readme.txt").write_text("no model")
+    first, second = (p.signature.notes for p in read_source(tmp_path).policies())
+    assert [n for n in first if n.startswith("also here")] == ["also here, not used: sub/ (give it by its path)"]
+    assert not [n for n in second if n.startswith("also here")]
+    assert not [n for p in read_source(tmp_path / "sub").policies() for n in p.signature.notes if "also here" in n]
+
+
 def test_0_1_to_0_5(tmp_path: Path) -> None:
     run = tmp_path / "models/ppo"
     checkpoint(run, "model-50.cptk", "model-7000.cptk")

@@ -108,6 +108,13 @@ def behaviors(folder: Path) -> list[Behavior]:
     return [found[name] for name in sorted(found)]
 
 
+def unread_folders(folder: Path) -> list[Path]:
+    """Folders beside a run's behaviors that hold exports and are none of them. Raises OSError."""
+    if _behavior(folder) is not None:
+        return []
+    return [f for f in _folders(folder) if _behavior(f) is None and any(_final(p) is not None for p in _files(f))]
+
+
 def runs(folder: Path) -> list[Path]:
     """Folders inside, for advice: those that hold a policy themselves. Not all of a home folder is looked through."""
     found = []

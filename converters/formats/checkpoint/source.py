@@ -6,11 +6,13 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
+from msgspec.structs import replace
+
 from converters.files.external_data import Detached
 from converters.files.fetch import Fetched
 from converters.formats.checkpoint import listing
 from converters.formats.checkpoint.freeze import freeze, with_values
-from converters.formats.checkpoint.listing import STEPPED, Behavior, behaviors, best, graph_of
+from converters.formats.checkpoint.listing import STEPPED, Behavior, behaviors, best, graph_of, unread_folders
 from converters.formats.checkpoint.policy_nodes import policy_nodes
 from converters.formats.checkpoint.table import MAGIC
 from converters.formats.checkpoint.tensor_bundle import Checkpoint, of_objects, version_1
@@ -162,7 +164,9 @@ def members(path: Path, options: ReadOptions) -> list[Member]:
     """
     found = behaviors(path)
     if options.step is None:
-        return [member for behavior in found for member in _finals(behavior)]
+        finals = [member for behavior in found for member in _finals(behavior)]
+        unread = left_out([f"{folder.name}/ (give it by its path)" for folder in unread_folders(path)])
+        return [*(replace(m, notes=(*m.notes, *unread)) for m in finals[:1]), *finals[1:]]
     kept = [b for b in found if options.step in b.steps]
     if not kept:
         raise no_such_step(options.step, sorted({s for b in found for s in b.steps}))
