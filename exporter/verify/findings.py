@@ -289,7 +289,8 @@ def failure(kind: str, runtime: str, error: RunFailedError, output: str = "*") -
 
 def undecided_reference(kind: str, runtime: str, error: RunFailedError) -> Undecided:
     """A reference that gave no answer: nothing was held against it."""
-    return undecided_finding(kind, runtime, "*", f"the {kind} gave no answer in {runtime}: {_error_text(error)}")
+    text = "; ".join(filter(None, map(str.strip, _error_text(error).splitlines())))  # it goes into the verdict's line
+    return undecided_finding(kind, runtime, "*", f"the {kind} gave no answer in {runtime}: {text}")
 
 
 def _error_text(error: RunFailedError) -> str:

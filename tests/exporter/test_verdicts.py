@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from converters.files.children.process import RunFailedError
+from exporter.verify.findings import undecided_reference
 from exporter.verify.statistics import FALSE_ALARM, same_distribution
 from fixtures import path as fixture
 from fixtures.trained import run_folder
@@ -121,3 +123,11 @@ def test_its_false_alarms_are_as_rare_as_stated() -> None:
     found = np.array([same_distribution(*rng.standard_normal((2, 300)), 0.0, 0.0) for _ in range(1500)])
     for level in (0.01, 0.05, 0.2):
         assert (found < level).mean() <= level + 3 * np.sqrt(level / 1500)
+
+
+def test_a_reference_that_gives_no_answer_is_told_in_one_line() -> None:
+    error = RunFailedError("numpy failed", why="ValueError: shapes\n  why: 2 and 1\n\n  fix: the inputs")
+    told = undecided_reference("reference", "numpy", error).reason
+    assert (
+        told == "the reference gave no answer in numpy: numpy failed: ValueError: shapes; why: 2 and 1; fix: the inputs"
+    )
