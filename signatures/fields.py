@@ -92,6 +92,9 @@ def read(content: Any, kind: Any, path: str = "") -> Any:
                 raise FieldError(path_text(where, path), f"must be {_TEXT}")
     except ValidationError as error:
         raise _explain(error, content, kind, path) from error
+    except UnicodeEncodeError as error:  # half of a surrogate pair, which JSON can spell
+        where = next((where for where, text in _texts(content, ()) if not text.isprintable()), ())
+        raise FieldError(path_text(where, path), f"must be {_TEXT}") from error
     except RecursionError as error:
         raise FieldError(path or "the whole", "is nested too deeply") from error
     return record

@@ -43,6 +43,8 @@ WRONG: tuple[tuple[Any, str], ...] = (
     ({"shape": [0] * 33}, "shape: must be a list of at most 32 items"),
     ({"on": 1}, "on: must be true or false"),
     ({"notes": ["a", "b\nc"]}, "notes[1]: must be text of 1 to 4000 printable characters"),
+    ({"notes": ["a", "\ud800"]}, "notes[1]: must be text of 1 to 4000 printable characters"),
+    ({"parts": {"\ud800": GOOD["p1"]}}, "parts: must be text of 1 to 4000 printable characters"),
     ({"notes": ["a", ""]}, "notes[1]: must be text of 1 to 4000 printable characters"),
     ({"parts": {"": {}}}, "parts: the name: must be text of 1 to 4000 printable characters"),
     ({"parts": {"a\x1b": GOOD["p1"]}}, "parts: must be text of 1 to 4000 printable characters"),

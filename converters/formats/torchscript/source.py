@@ -17,6 +17,7 @@ from msgspec.structs import replace
 
 from converters.files.fetch import Fetched
 from converters.files.pickled_objects import Instance
+from converters.files.torch_archive import Storage
 from converters.files.torchscript_archive import ScriptArchive
 from converters.files.unpickle import Tensor as Stored
 from converters.formats.source import ReadOptions, SourceModel
@@ -128,7 +129,8 @@ def _given_inputs(names: Sequence[str], traced: Any, sensors: Sequence[tuple[int
         return [_Input(name, (1, *shape)) for name, shape in zip(names, sensors, strict=True)]
     inputs = traced.get(_FORWARD) if isinstance(traced, dict) else None
     inputs = inputs if isinstance(inputs, list | tuple) else []
-    known = [i for i in inputs if isinstance(i, Stored) and len(i.shape) <= _MAX_AXES]
+    stored = [i for i in inputs if isinstance(i, Stored) and isinstance(i.storage, Storage)]
+    known = [i for i in stored if len(i.shape) <= _MAX_AXES]
     if len(known) == len(inputs) == len(names):
         rows = known[0].shape[0] if known[0].shape else 1
         dtypes = [_FED.get(i.storage.dtype, FLOAT32) for i in known]
