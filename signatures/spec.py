@@ -222,6 +222,7 @@ class SourceMap(Record, frozen=True):
     - ``rows``: the only number of rows that the source takes, or gets right; None: any.
     - ``parts``: inputs and outputs that stand for several tensors of the source, or for one of another shape (memories
       of their own, joined to one row): they are not among ``feeds`` and ``fetches``.
+    - ``fixed_rows``: those of ``fixed`` whose row is fed once for each agent.
     """
 
     feeds: Mapping[str, str] = field(default_factory=dict)
@@ -233,6 +234,7 @@ class SourceMap(Record, frozen=True):
     branches: Many[Text | None] = explicit_default(tuple)
     rows: Annotated[int, Meta(ge=1, le=2**63 - 1)] | None = explicit_default(lambda: None)
     parts: Mapping[Text, Many[SourcePart]] = field(default_factory=dict)
+    fixed_rows: Many[Text] = field(default_factory=tuple)
 
     def all_fetches(self) -> list[str]:
         """Every tensor of the source that it may be asked for."""

@@ -15,7 +15,7 @@ from converters.compiler.passes.batch_axis import for_any_number, without_agents
 from converters.compiler.passes.best_action import rank_actions
 from converters.compiler.passes.doubles import narrow_doubles
 from converters.compiler.passes.fold import fold
-from converters.compiler.passes.inputs import complete_shapes, set_values, settle_inputs
+from converters.compiler.passes.inputs import complete_shapes, give_rows, set_values, settle_inputs
 from converters.compiler.passes.memories import Joined, join_memories
 from converters.compiler.passes.mixtures import settle_mixtures
 from converters.compiler.passes.naming import name_ports
@@ -37,6 +37,7 @@ from converters.policy.inputs import classify_inputs, explain_inputs
 from converters.policy.policy import Policy
 from converters.policy.rules import Decision
 from signatures.errors import NotAPolicyError, UsageError
+from signatures.roles import OBSERVATIONS
 
 FOLD = Pass("fold", on_graph(fold), (has.no_control_flow,), (has.constants_folded,))
 DROP = Pass(
@@ -99,6 +100,9 @@ def compilations(graph: Graph, options: CompileOptions, facts: SourceFacts) -> l
     found = []
     for brain in _chosen_brains(brains, options.brain):
         roles = classify_inputs(graph, brain, options.inputs, facts.roles, declared=bool(facts.outputs))
+        observation = next((n for n, r in roles.items() if r in OBSERVATIONS), None)
+        if options.values and observation is not None:
+            graph = give_rows(graph, original, options.values, observation)
         canonical = brain.canonical
         outputs = [(canonical[base], reference) for base, _, reference in brain.outputs if base in canonical]
         upstream = graph.prune([reference for _, reference in outputs])

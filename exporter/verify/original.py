@@ -165,7 +165,8 @@ class Original:
         for spec in self.signature.inputs:
             if spec.name in self.source.parts:
                 placed.update(split_memory(self.source.parts[spec.name], feeds[spec.name]))
-        placed.update({name: np.asarray(value) for name, value in self.source.fixed.items()})
+        for name, value in self.source.fixed.items():
+            placed[name] = np.repeat(value, batch, axis=0) if name in self.source.fixed_rows else np.asarray(value)
         placed.update({n: np.full([1] * rank, batch, np.int32) for n, rank in self.source.batch_sizes.items()})
         for tensor, dims in self.source.noise.items():
             shape = [batch if d is None else d for d in dims]

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from converters.compiler.passes.normalise import as_placeholder
 from converters.graph.editor import Editor
-from converters.graph.nodes import Graph, Node, TensorShape, downstream
+from converters.graph.nodes import Graph, Node, TensorShape, downstream, node_of, topological
 from converters.graph.ops.base import Layer
 from converters.graph.ops.loops.layers import window_padding
 from converters.graph.ops.table import is_fed, traits
@@ -38,6 +38,39 @@ def set_values(graph: Graph, values: Mapping[str, float]) -> Graph:
             node = constant_for(node, values[node.name])
         nodes.append(node)
     return Graph(tuple(nodes))
+
+
+def give_rows(graph: Graph, original: Graph, values: Mapping[str, float], observation: str) -> Graph:
+    """Values of ``--set`` with a row for each agent, where they are joined to what the agents are fed.
+
+    A single row goes with any number wherever elements meet one another, but not in a concatenation.
+    """
+    alone, set_here = set[str](), set[str]()
+    joined = False
+    for node in graph.nodes:
+        sources = {node_of(r) for r in node.inputs}
+        if node.name in values:
+            set_here.add(node.name)
+        elif not is_fed(node) and sources and sources <= alone | set_here:
+            (set_here if sources & set_here else alone).add(node.name)
+        elif node.op == "Const":
+            alone.add(node.name)
+        elif traits(node).moves == "join" and sources & set_here:
+            joined = True
+    if not joined:
+        return graph
+    editor = Editor(graph)
+    for node in graph.nodes:
+        dims = original[node.name].dims if node.name in values else None
+        if not dims or dims[0] is not None:
+            editor.keep(node)
+            continue
+        row = editor.const(constant_value(original[node.name], values[node.name]), f"{node.name}/row")
+        count = _first_length(editor, observation, node.name, vector=True)
+        others = editor.ints([1] * (len(dims) - 1), f"{node.name}/others")
+        times = editor.add("ConcatV2", [count, others, editor.ints(0, f"{node.name}/axis")], f"{node.name}/times")
+        editor.redirect(node.name, editor.add("Tile", [row, times], f"{node.name}/rows"))
+    return Graph(topological(editor.graph().nodes))
 
 
 def constant_value(node: Node, value: float) -> np.ndarray:
@@ -97,12 +130,13 @@ def batch_size_rank(graph: Graph, node: Node) -> int:
 
 def _batch_size(editor: Editor, graph: Graph, node: Node, observation: str) -> str:
     """Shape(observation)[0]: a scalar, or a vector of one where the graph uses it as one."""
-    wants_vector = batch_size_rank(graph, node) == 1
-    shape = editor.add("Shape", [observation], f"{node.name}/shape", out_type=INT32)
-    bounds = [editor.ints([v], f"{node.name}/{k}") for k, v in (("b", 0), ("e", 1), ("s", 1))]
-    return editor.add(
-        "StridedSlice", [shape, *bounds], f"{node.name}/derived", shrink_axis_mask=0 if wants_vector else 1
-    )
+    return _first_length(editor, observation, node.name, vector=batch_size_rank(graph, node) == 1)
+
+
+def _first_length(editor: Editor, observation: str, name: str, *, vector: bool) -> str:
+    shape = editor.add("Shape", [observation], f"{name}/shape", out_type=INT32)
+    bounds = [editor.ints([v], f"{name}/{k}") for k, v in (("b", 0), ("e", 1), ("s", 1))]
+    return editor.add("StridedSlice", [shape, *bounds], f"{name}/derived", shrink_axis_mask=0 if vector else 1)
 
 
 def complete_shapes(graph: Graph, roles: Mapping[str, Role]) -> Graph:

@@ -395,6 +395,7 @@ def source_map(c: Compilation) -> SourceMap:
     }
     given = {tensor_of(c.original[n]): constant_value(c.original[n], v) for n, v in c.options.values.items()}
     parts = {s.name: c.parts[s.role] for s in (*inputs, *outputs) if s.role in c.parts}
+    given_rows = [n for n in c.options.values if source.get(n) is None and (c.original[n].dims or (0,))[0] is None]
     return SourceMap(
         feeds=sources(inputs, parts),
         fetches=sources(outputs, parts),
@@ -407,4 +408,5 @@ def source_map(c: Compilation) -> SourceMap:
         branches=c.branch_origins,
         rows=c.facts.rows,
         parts=parts,
+        fixed_rows=tuple(tensor_of(c.original[n]) for n in given_rows),
     )

@@ -1,0 +1,49 @@
+"""Inputs that ``--set`` gives one value: a row for each agent where they are joined to what the agents are fed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from converters.compiler.options import CompileOptions
+from converters.graph.run import run_graph
+from converters.policy.policy import Policy
+from exporter.demo import FOLDER
+from exporter.export.sources import read_source
+from tests.commands import export_model
+
+HALLWAY = FOLDER / "Hallway.bytes"
+ROWS = 5
+
+
+def compiled(**values: float) -> Policy:
+    (policy,) = read_source(HALLWAY).policies(CompileOptions(values=values))
+    return policy
+
+
+@pytest.mark.parametrize("before", [0, 2])
+def test_it_gives_what_the_policy_gives_that_is_fed_the_value(before: int) -> None:
+    free, fixed = compiled(), compiled(prev_action=before)
+    assert [s.name for s in fixed.signature.inputs] == ["state", "action_masks", "recurrent_in"]
+    random = np.random.default_rng(0)
+    feeds = {
+        "state": random.standard_normal((ROWS, 4)).astype(np.float32),
+        "action_masks": np.ones((ROWS, 3), np.float32),
+        "recurrent_in": random.standard_normal((ROWS, 32)).astype(np.float32),
+    }
+    outputs = [s.name for s in fixed.signature.outputs]
+    wanted = run_graph(free.graph, {**feeds, "prev_action": np.full((ROWS, 1), before, np.int32)}, outputs)
+    given = run_graph(fixed.graph, feeds, outputs)
+    for name in outputs:
+        np.testing.assert_allclose(given[name], wanted[name], atol=1e-6, err_msg=name)
+
+
+@pytest.mark.runtimes
+def test_tensorflow_runs_the_source_with_a_row_for_each_agent(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    ran = export_model(HALLWAY, "--set", "prev_action=1", "-o", out, "--to", "bytes,onnx", "--verify", "tensorflow")
+    assert ran.status == 0 and "PASSED" in ran.out, ran.err
+    again = export_model("verify", out / "Hallway", "--runtimes", "tensorflow", "--source", HALLWAY)
+    assert again.status == 0, again.err
