@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 @click.argument("reference", type=PATH)
 @click.argument("candidates", nargs=-1, type=PATH, metavar="[CANDIDATE]...")
 @click.option("--env", required=True, metavar="ENV", help="3DBall and others of ours, a Gymnasium id, or module:make.")
-@click.option("--episodes", type=int, default=200, metavar="N", help="Episodes that each plays.")
+@click.option("--episodes", type=int, default=200, metavar="N", help="Episodes that each plays, 20 or more.")
 @click.option("--most", type=int, default=12_800, metavar="N", help="Play up to N others where these do not decide.")
 @click.option("--seed", type=int, default=0, metavar="N", help="Seed of the episodes and of drawn actions.")
 @click.option("--margin", default="1%", metavar="SIZE", help="How far mean returns may be apart: 1%, or a number.")
