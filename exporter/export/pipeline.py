@@ -247,7 +247,7 @@ class Exporter:
                 with bundle.writing(out):
                     (stage / PARITY).write_bytes(bundle.dumps(report.to_dict()))
             failed = report is not None and report.passed is False
-            place = put(stage, f"{policy.name}.failed" if failed else policy.name)
+            place = put(stage, f"{policy.name}{bundle.FAILED}" if failed else policy.name)
         return ExportResult(
             policy=policy,
             folder=place,

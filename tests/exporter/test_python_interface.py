@@ -221,6 +221,15 @@ def test_the_command_line_ends_with_status_1(tmp_path: Path) -> None:
     assert (as_json.json["policies"][0]["passed"], as_json.json["policies"][0]["parity"]["passed"]) == (False, False)
 
 
+@pytest.mark.usefixtures("disagreeing")
+def test_what_was_set_aside_goes_with_the_next_that_agrees(tmp_path: Path) -> None:
+    export_model(BALL, tmp_path, strict=False)
+    (tmp_path / "discrete.failed").mkdir()  # no bundle, so not ours to remove
+    for source, left in ((fixture("discrete"), {"continuous.failed", "discrete"}), (BALL, {"continuous", "discrete"})):
+        export_model(source, tmp_path, verify="none")
+        assert {p.name for p in tmp_path.iterdir()} == {*left, "discrete.failed"}
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("disagreeing")
 def test_verifying_again_ends_with_status_1_too(tmp_path: Path) -> None:

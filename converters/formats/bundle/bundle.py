@@ -16,7 +16,7 @@ from msgspec.structs import replace
 
 from converters.files.fetch import inside, neighbours, path_text
 from converters.formats.bundle.embed import contract_text, without_contract
-from converters.formats.bundle.exchange import exchange, recover, stage
+from converters.formats.bundle.exchange import exchange, recover, stage, take_away
 from converters.formats.format import Artifact, Format
 from converters.formats.frozen_graph.reader import read_graph
 from converters.graph.nodes import Graph
@@ -30,6 +30,8 @@ from signatures.spec import PolicySignature
 #: Tensor → what its artefact says of it: dtype and shape.
 Declared: TypeAlias = Mapping[str, tuple[str | None, Sequence[object] | None]]
 _AGAIN = "export the policy again"
+#: What the name of a bundle ends with whose formats disagree.
+FAILED = ".failed"
 #: A contract is some kilobytes; one with labels and statistics of large observations some hundred.
 _MOST_BYTES = 64 << 20
 
@@ -246,10 +248,14 @@ def stage_bundle(place: Path, contract: Contract, artifacts: Sequence[Artifact])
 
 
 def put_in_place(new: Path, place: Path) -> None:
-    """Exchange a staged bundle with what is at ``place``. Raises BundleError."""
+    """Exchange a staged bundle with what is at ``place``; what was set aside there goes. Raises BundleError."""
     check_replaceable(place)
     with writing(place):
         exchange(new, place)
+    failed = place.with_name(place.name + FAILED)
+    if (failed / POLICY).is_file() and not failed.is_symlink():
+        with writing(failed, "cannot be removed"):
+            take_away(failed)
 
 
 def check_replaceable(place: Path) -> None:

@@ -57,6 +57,12 @@ def exchange(new: Path, place: Path) -> None:
         warnings.warn(f"{place} may be lost in a power cut: {error}", LeftoverWarning, stacklevel=2)
 
 
+def take_away(place: Path) -> None:
+    """Remove a folder: whole, or not at all where the process is killed. Raises OSError."""
+    with OwnFolder(place.parent, f"{_PREFIX}{place.name}-") as outer:
+        place.rename(outer / "old")
+
+
 def recover(place: Path) -> None:
     """Put back what a run that was killed between two renames had moved out of ``place``. Raises OSError."""
     if not place.parent.is_dir() or place.exists():
