@@ -20,7 +20,7 @@ from msgspec.structs import replace
 
 from signatures.bounded import loads
 from signatures.code import CHOICES
-from signatures.fields import Blank, Count, FieldError, Number, Record, Text, Whole, one_of, path_text, read
+from signatures.fields import WHOLE, Blank, Count, FieldError, Number, Record, Text, Whole, one_of, path_text, read
 from signatures.interface import parse_interface
 from signatures.labels import parse_labels
 from signatures.roles import INPUT_ROLES, Role
@@ -150,7 +150,7 @@ def json_of(text: str | bytes) -> Any:
     try:
         return loads(text, parse_constant=_no_number, parse_float=_finite)
     except (ValueError, RecursionError) as error:
-        raise FieldError("the whole", f"is not JSON ({error})"[:200]) from error
+        raise FieldError(WHOLE, f"is not JSON ({error})"[:200]) from error
 
 
 def _no_number(word: str) -> float:
@@ -167,7 +167,7 @@ def _finite(text: str) -> float:
 def parse(content: Any) -> Contract:
     """The contract in what JSON said. Raises FieldError that names the field."""
     if not isinstance(content, Mapping):
-        raise FieldError("the whole", "must be an object")
+        raise FieldError(WHOLE, "must be an object")
     if content.get("schema") != SCHEMA:
         raise FieldError("schema", f"is {str(content.get('schema'))[:20]!r}, and this version reads {SCHEMA}")
     head: _Head = read(content, _Head)
@@ -181,7 +181,7 @@ def parse(content: Any) -> Contract:
 def parse_signature(content: Any) -> PolicySignature:
     """The part of a contract that describes the policy. Raises FieldError."""
     if not isinstance(content, Mapping):
-        raise FieldError("the whole", "must be an object")
+        raise FieldError(WHOLE, "must be an object")
     apart = ("preprocess", "labels", "interface")
     kept = {key: value for key, value in content.items() if key not in apart}
     found: PolicySignature = read(kept, PolicySignature)

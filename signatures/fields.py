@@ -32,6 +32,10 @@ Many = Annotated[tuple[T, ...], Meta(max_length=100_000)]
 _LOOSE = ("distribution", "metadata")
 
 
+#: What the field is called that is all of a document.
+WHOLE = "the whole"
+
+
 class FieldError(ValueError):
     """A value is not what stands there; ``field`` is its path (``inputs[0].shape``)."""
 
@@ -96,14 +100,14 @@ def read(content: Any, kind: Any, path: str = "") -> Any:
         where = next((where for where, text in _texts(content, ()) if not text.isprintable()), ())
         raise FieldError(path_text(where, path), f"must be {_TEXT}") from error
     except RecursionError as error:
-        raise FieldError(path or "the whole", "is nested too deeply") from error
+        raise FieldError(path or WHOLE, "is nested too deeply") from error
     return record
 
 
 def path_text(steps: Steps, path: str = "") -> str:
     """``inputs[0].shape``."""
     text = path + "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in steps)
-    return text.removeprefix(".") or "the whole"
+    return text.removeprefix(".") or WHOLE
 
 
 def _texts(value: Any, where: tuple[str | int, ...]) -> Iterator[tuple[tuple[str | int, ...], str]]:

@@ -102,8 +102,8 @@ def _artefact(folder: Path) -> Member:
         raise BundleError(
             "names no file that can be read",
             where=str(folder / POLICY),
-            why=f"a bundle has one of {', '.join(f.main_of(bundle.name) for f in able)}",
-            fix="export the policy again",
+            why=f"it has none of {', '.join(f.main_of(bundle.name) for f in able)}",
+            fix=f"give what it was made from ({bundle.contract.origin.path}), or export that with bytes in --to",
         )
     bundle.verify_hashes(found)
     made_for = bundle.contract.tool.get("profile")

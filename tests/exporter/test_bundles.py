@@ -244,7 +244,7 @@ def test_a_folder_without_a_contract_is_no_bundle(tmp_path: Path) -> None:
 @pytest.mark.parametrize("text", ["", "{", "nonsense", "[" * 100_000, '{"schema": 1', "\x00"])
 def test_a_contract_that_is_no_json_is_refused(text: str, ball: Path) -> None:
     (ball / "policy.json").write_text(text)
-    is_no_bundle(ball, ball / "policy.json", "is not JSON")
+    is_no_bundle(ball, ball / "policy.json", "is not JSON", "cut off or damaged")
 
 
 @pytest.mark.parametrize("text", ["{}", '{"schema": 2}', '{"schema": "1"}'])

@@ -24,7 +24,7 @@ from converters.graph.shapes import infer_types
 from signatures.contract import PARITY, POLICY, Contract, FileEntry, json_of, parse
 from signatures.digest import sha256_of_file
 from signatures.errors import BundleError, UsageError
-from signatures.fields import FieldError
+from signatures.fields import WHOLE, FieldError
 from signatures.spec import PolicySignature
 
 #: Tensor → what its artefact says of it: dtype and shape.
@@ -78,6 +78,8 @@ class Bundle(Struct, frozen=True):
         except OSError as error:
             raise unfit(path, "cannot be read", error.strerror) from error
         except FieldError as error:
+            if error.field == WHOLE:
+                raise unfit(path, f"{WHOLE} {error.why}", "the file is cut off or damaged") from error
             raise BundleError(
                 f"{error.field} {error.why}",
                 where=str(path),
