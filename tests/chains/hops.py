@@ -54,7 +54,8 @@ class Hop:
 def exported(place: Path, out: Path, hop: Hop, options: CompileOptions) -> list[ExportResult]:
     """The policies of a source in the format of a hop."""
     how = replace(options, names=hop.names, deterministic=hop.deterministic)
-    return list(export([place], ExportOptions(out, hop.targets, compile=how, opset=hop.opset, verify="none")))
+    opset = hop.opset if "onnx" in hop.targets else None  # of other formats it says nothing, and is refused
+    return list(export([place], ExportOptions(out, hop.targets, compile=how, opset=opset, verify="none")))
 
 
 def walk(start: Start, chain: Sequence[Hop], folder: Path) -> list[tuple[ExportResult, ExportResult]]:
