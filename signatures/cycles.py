@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import gc
 
 #: New objects between two collections (Python's default is 700): a policy makes some ten thousand, imports as many.
@@ -11,3 +12,5 @@ _OBJECTS = 20_000
 def raise_gc_threshold() -> None:
     """Raise the garbage collector's threshold for a whole process of ours: collecting took a tenth of its time."""
     gc.set_threshold(_OBJECTS, 20, 20)
+    atexit.unregister(gc.freeze)
+    atexit.register(gc.freeze)  # Python's end looks through all that is left, twice: 10 ms of a cold export
