@@ -95,14 +95,15 @@ def compilations(graph: Graph, options: CompileOptions, facts: SourceFacts) -> l
     """(what tells a brain from the others of its graph, the brain before the first pass)."""
     joined = _prepare(graph, options, facts)
     original, options, facts = joined.graph, joined.options, joined.facts
-    graph = set_values(original, options.values)
-    brains = find_brains(graph, options.outputs, facts.outputs, facts.decisions)
+    given = set_values(original, options.values)
+    brains = find_brains(given, options.outputs, facts.outputs, facts.decisions)
     found = []
     for brain in _chosen_brains(brains, options.brain):
-        roles = classify_inputs(graph, brain, options.inputs, facts.roles, declared=bool(facts.outputs))
+        roles = classify_inputs(given, brain, options.inputs, facts.roles, declared=bool(facts.outputs))
         observation = next((n for n, r in roles.items() if r in OBSERVATIONS), None)
+        graph = given
         if options.values and observation is not None:
-            graph = give_rows(graph, original, options.values, observation)
+            graph = give_rows(given, original, options.values, observation)
         canonical = brain.canonical
         outputs = [(canonical[base], reference) for base, _, reference in brain.outputs if base in canonical]
         upstream = graph.prune([reference for _, reference in outputs])

@@ -14,7 +14,7 @@ _SIZES = {LONG: 8, SHORT: 4, GROUP: 0, GROUP_END: 0}
 
 
 class WireError(Exception):
-    """What lies there is no field."""
+    """The bytes there must be a field, and are not."""
 
 
 class CutOffError(WireError):

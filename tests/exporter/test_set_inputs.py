@@ -7,12 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from converters.compiler.compile import compile_graph
 from converters.compiler.options import CompileOptions
+from converters.formats.frozen_graph.reader import read_graph
 from converters.graph.run import run_graph
 from converters.policy.policy import Policy
 from exporter.demo import FOLDER
 from exporter.export.sources import read_source
 from tests.commands import export_model
+from tests.handmade import constant, dense, graph_bytes, node, placeholder
 
 HALLWAY = FOLDER / "Hallway.bytes"
 ROWS = 5
@@ -38,6 +41,22 @@ def test_it_gives_what_the_policy_gives_that_is_fed_the_value(before: int) -> No
     given = run_graph(fixed.graph, feeds, outputs)
     for name in outputs:
         np.testing.assert_allclose(given[name], wanted[name], atol=1e-6, err_msg=name)
+
+
+def test_each_brain_of_a_file_takes_the_rows_of_its_own_observation() -> None:
+    nodes = []
+    for scope in ("First", "Second"):
+        nodes += [
+            placeholder(f"{scope}/vector_observation", (None, 2)),
+            placeholder(f"{scope}/before", (None, 1)),
+            constant(f"{scope}/axis", np.int32(1)),
+            node(f"{scope}/both", "ConcatV2", f"{scope}/vector_observation", f"{scope}/before", f"{scope}/axis"),
+            *dense(f"{scope}/action", f"{scope}/both", 3, 2),
+        ]
+    values = {"First/before": 0.5, "Second/before": 0.5}
+    policies = compile_graph(read_graph(graph_bytes(nodes)), "policy", CompileOptions(values=values))
+    inputs = [[(s.name, s.source) for s in p.signature.inputs] for p in policies]
+    assert inputs == [[("state", "First/vector_observation:0")], [("state", "Second/vector_observation:0")]]
 
 
 @pytest.mark.runtimes

@@ -239,25 +239,6 @@ def opcode(part: bytes, random: Random) -> bytes:
     return random.choice(_CODES) + (part if random.random() < 0.5 else b"")
 
 
-#: What the structures of an HDF5 file begin with: super block, B-trees, heaps, object headers and their parts.
-_HDF5_SIGNS = (b"\x89HDF", b"TREE", b"HEAP", b"SNOD", b"GCOL", b"OHDR", b"OCHK")
-
-
-def hdf5(files: Files, random: Random) -> Files:
-    """Numbers near the signs of its structures, which say how much comes and where; or any bytes."""
-    ((name, data),) = files.items()
-    signs = [m.start() for sign in _HDF5_SIGNS for m in re.finditer(re.escape(sign), data)]
-    for _ in range(random.choice((1, 1, 2, 3, 6))):
-        if random.random() < 0.3:
-            data = mutation.damaged(data, random)
-            continue
-        size = random.choice((1, 2, 4, 8))
-        at = min(random.choice(signs) + random.randrange(4, 128), len(data) - size)
-        number = mutation.number(random) % (1 << 8 * size)
-        data = data[:at] + number.to_bytes(size, "little") + data[at + size :]
-    return {name: data}
-
-
 def pickled(files: Files, random: Random) -> Files:
     data = files["policy.pt"]
     if not data.startswith(b"PK") or random.random() < 0.05:

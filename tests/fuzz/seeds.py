@@ -25,7 +25,7 @@ from fixtures import FOLDER, path
 from signatures.errors import ExportModelError
 from tests.checkpoint.writing import bundle as write_checkpoint
 from tests.checkpoint.writing import policy as training_policy
-from tests.fuzz import changes, robots
+from tests.fuzz import changes, hdf5, robots
 from tests.fuzz.changes import Files
 from tests.handmade import constant, continuous_policy, graph_bytes, graph_def, node, sampled_policy
 from tests.hostile import zoo
@@ -355,7 +355,7 @@ def _tables() -> Iterator[tuple[str, Reader]]:
     yield "VecNormalize", Reader(_normalised, changes.statistics, "policy.zip")
     yield "bundle", Reader(_bundles, changes.bundle, takes="bundle")
     yield "Keras", Reader(_keras, changes.keras_config, "policy.keras", takes="configuration")
-    yield "HDF5", Reader(_hdf5_models, changes.hdf5, "policy.h5", takes="stored")
+    yield "HDF5", Reader(_hdf5_models, hdf5.change_structures, "policy.h5", takes="stored")
     yield "recording", Reader(_recordings, changes.recording, takes="recording")
 
 

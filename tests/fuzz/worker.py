@@ -102,7 +102,7 @@ def _configuration(path: Path, out: Path) -> None:
             build_layered((path,), config, Groups(dict(stored)), "3.0.0")
 
 
-def _kept(path: Path, out: Path) -> None:
+def _inspect_stored(path: Path, out: Path) -> None:
     """An ``.h5``, its bytes read by h5py in the confined child; a process each, so ``inspect`` alone."""
     inspection_text(inspect_source(path))
 
@@ -112,7 +112,7 @@ COMMANDS: dict[str, tuple[Callable[[Path, Path], None], ...]] = {
     "bundle": (_source, _bundle, _candidate),
     "recording": (_recording,),
     "configuration": (_configuration,),
-    "stored": (_kept,),
+    "stored": (_inspect_stored,),
 }
 
 

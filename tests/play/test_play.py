@@ -270,7 +270,7 @@ def test_the_public_module_plays(bundles: Path) -> None:
 
 
 @pytest.mark.parametrize(("said", "threads"), [(None, "1"), ("3", "3")])
-def test_numpy_takes_one_thread_where_the_command_plays(said: str | None, threads: str, tmp_path: Path) -> None:
+def test_numpy_takes_one_thread_in_a_command(said: str | None, threads: str, tmp_path: Path) -> None:
     """In a process of its own: the user's environment module says what it finds."""
     (tmp_path / "says.py").write_text("import os\nraise SystemExit(os.environ.get('OPENBLAS_NUM_THREADS'))\n")
     own = {k: v for k, v in os.environ.items() if k != "OPENBLAS_NUM_THREADS"}

@@ -88,17 +88,24 @@ def _from_image(m: Machine, image: str, axes: int) -> Tensor:
 def _convolution(
     m: Machine, x: Any, weight: Any, bias: Any, stride: Any, padding: Any, dilation: Any, groups: Any
 ) -> Tensor:
+    kernel, axes = _kernel(m, weight)
+    m.expect(m.ref(x), 1, kernel.shape[1] * groups)
+    window = _window(kernel.shape[-axes:], stride, padding, dilation)
+    made = conv2d(m.b, _as_image(m, x, axes), kernel.transpose(2, 3, 1, 0), window, groups)
+    return _biased_image(m, made, bias, axes)
+
+
+def _kernel(m: Machine, weight: Any) -> tuple[np.ndarray, int]:
+    """[…, …, height, width], the height 1 for one over a row, and how many axes it has of an image."""
     kernel = m.constant_numbers(weight, "the kernel")
     axes = kernel.ndim - 2
     if axes not in (1, 2):
         raise UnsupportedOpError(f"a kernel of {kernel.ndim} axes", why="one and two axes are known")
-    m.expect(m.ref(x), 1, kernel.shape[1] * groups)
-    window = _window(kernel.shape[2:], stride, padding, dilation)
-    wide = kernel if axes == 2 else kernel[:, :, None, :]
-    made = conv2d(m.b, _as_image(m, x, axes), wide.transpose(2, 3, 1, 0), window, groups)
-    if bias is not None:
-        made = m.b.add("BiasAdd", [made, m.ref(bias)])
-    return _from_image(m, made, axes)
+    return (kernel if axes == 2 else kernel[:, :, None, :]), axes
+
+
+def _biased_image(m: Machine, image: str, bias: Any, axes: int) -> Tensor:
+    return _from_image(m, image if bias is None else m.b.add("BiasAdd", [image, m.ref(bias)]), axes)
 
 
 def _conv(
@@ -128,19 +135,13 @@ def _turn_convolution(
     dilation: Any = 1,
 ) -> Tensor:
     """The kernel is [in, out per group, …]."""
-    kernel = m.constant_numbers(weight, "the kernel")
-    axes = kernel.ndim - 2
-    if axes not in (1, 2):
-        raise UnsupportedOpError(f"a kernel of {kernel.ndim} axes", why="one and two axes are known")
+    kernel, axes = _kernel(m, weight)
     m.expect(m.ref(x), 1, kernel.shape[0])
-    window = _window(kernel.shape[2:], stride, padding, dilation)
-    wide = kernel if axes == 2 else kernel[:, :, None, :]
+    window = _window(kernel.shape[-axes:], stride, padding, dilation)
     extra = _numbers(output_padding, axes)
     behind = (extra[0], extra[1]) if axes == 2 else (0, extra[0])
-    made = conv2d_transposed(m.b, _as_image(m, x, axes), wide.transpose(2, 3, 0, 1), window, behind, groups)
-    if bias is not None:
-        made = m.b.add("BiasAdd", [made, m.ref(bias)])
-    return _from_image(m, made, axes)
+    made = conv2d_transposed(m.b, _as_image(m, x, axes), kernel.transpose(2, 3, 0, 1), window, behind, groups)
+    return _biased_image(m, made, bias, axes)
 
 
 def _traced_conv(
