@@ -25,8 +25,10 @@ from signatures.roles import Role
 
 
 class Outputs(Struct, frozen=True):
-    """Tensors that a step keeps: ``roots`` all of them, ``branches`` those that are joined of branches, so that the
-    number of branches can be told from the graph.
+    """Tensors that a step keeps.
+
+    ``roots`` are all of them, ``branches`` those that are joined of branches, so that the number of branches can be
+    told from the graph.
     """
 
     roots: tuple[str, ...]

@@ -45,8 +45,9 @@ class Detached:
 
     @classmethod
     def of(cls, arrays: Iterable[np.ndarray]) -> Detached:
-        """For a message of these arrays: if they are small together, all stay in it, which takes less than to look for
-        their places in it.
+        """Return the store for a message of these arrays.
+
+        If they are small together, all stay in the message, which takes less than to look for their places in it.
         """
         return cls(LARGE if sum(a.nbytes for a in arrays) >= LARGE_FILE else LARGE_FILE)
 

@@ -60,8 +60,10 @@ class Fetched:
         return other
 
     def digest(self, files: Iterable[Path]) -> str:
-        """The sha256 of a single file, or of the hashes of several in the order of their names. Raises SourceError for
-        what ``open_regular_file`` refuses, and where all together are larger than weights may be.
+        """The sha256 of a single file, or of the hashes of several in the order of their names.
+
+        Raises SourceError for what ``open_regular_file`` refuses, and where all together are larger than weights may
+        be.
         """
         left, hashes = MAX_WEIGHTS, []
         for each in sorted(set(files)):
@@ -75,8 +77,10 @@ class Fetched:
 
 
 def read_bytes(path: Path, *, empty: bool = False, most: int = MAX_BYTES) -> bytes:
-    """The file's bytes. Raises SourceError where it is missing, a folder or unreadable, DamagedFileError where it is
-    empty, unless it may be; ``most`` bytes are read.
+    """The file's bytes, ``most`` of them at most.
+
+    Raises SourceError where it is missing, a folder, unreadable or larger, DamagedFileError where it is empty, unless
+    it may be (``empty``).
     """
     with open_regular_file(path, most) as file:
         try:

@@ -89,8 +89,9 @@ class Content:
 
 
 def json_in(data: bytes | str) -> Any:
-    """Parse untrusted JSON text. Raises ValueError, too where a text in it is none or there are too many
-    values, and RecursionError.
+    """Parse untrusted JSON text.
+
+    Raises ValueError for other text, for half a surrogate pair and for too many values; and RecursionError.
     """
     text = data if isinstance(data, str) else data.decode("utf-8-sig")
     found = loads(text)

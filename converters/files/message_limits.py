@@ -30,8 +30,9 @@ _TABLES: dict[str, Table] = {}
 
 
 def check_size(message_class: Any, data: bytes) -> None:
-    """Raise NotAPolicyError where a serialised message has more than MAX_FIELDS fields. What is damaged is protobuf's
-    to refuse, which reads as far as the damage.
+    """Raise NotAPolicyError where a serialised message has more than MAX_FIELDS fields.
+
+    A damaged message is left to protobuf, which reads as far as the damage and refuses it.
     """
     if len(data) >= _FROM and fields_of(data, _table(message_class.DESCRIPTOR), MAX_FIELDS) > MAX_FIELDS:
         raise NotAPolicyError(

@@ -70,9 +70,11 @@ def unpickle_objects(
     *,
     functions: bool = False,
 ) -> Any:
-    """Return the value of a pickle that may hold objects. ``storage`` makes what a persistent id stands for; ``names``
-    are functions of this program, for names that the pickle calls. ``functions``: it may describe functions (as
-    cloudpickle does), whose code names builtins; they stay names, as all others.
+    """Return the value of a pickle that may hold objects.
+
+    ``storage`` makes what a persistent id stands for; ``names`` are functions of this program, for names that the
+    pickle calls. ``functions``: it may describe functions (as cloudpickle does), whose code names builtins; they stay
+    names, as all others.
 
     Raises NotAPolicyError for a name that acts on the machine, DamagedFileError for what breaks the rules of pickles.
     """

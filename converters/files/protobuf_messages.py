@@ -32,8 +32,10 @@ _MESSAGE_KIND, _OPTIONAL, _REPEATED = 11, 1, 3
 def message_classes(
     package: str, messages: Mapping[str, str], oneofs: Mapping[str, str], syntax: str
 ) -> Mapping[str, Any]:
-    """The class of each message. A message's fields are "number name kind", with commas between them, kind with ``*``
-    for repeated and ``<K`` for a map from string to K.
+    """The class of each message.
+
+    A message's fields are "number name kind", with commas between them, kind with ``*`` for repeated and ``<K`` for a
+    map from string to K.
 
     ``oneofs`` names the one oneof that all fields of a message are members of: their presence is visible even at the
     default value, as it is of every field in ``proto2``.

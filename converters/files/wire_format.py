@@ -1,5 +1,6 @@
-"""Protobuf's wire format: the fields of a message, and whole numbers (seven bits a byte, the lowest first), which
-TensorFlow's tables write likewise.
+"""Protobuf's wire format: the fields of a message, and whole numbers (varints).
+
+A varint has seven bits a byte, the lowest first; TensorFlow's tables write whole numbers likewise.
 """
 
 from __future__ import annotations

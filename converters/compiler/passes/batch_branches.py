@@ -251,8 +251,9 @@ class _Joining:
         return self.editor.add(first.op, operands, f"{first.name}/joined", **first.attrs)
 
     def _operand(self, parts: Sequence[str], given: Sequence[str], activation: bool) -> str | None:
-        """What one operand of the parts is for all of them. An activation is not taken from products that stay apart:
-        runtimes have the two in one.
+        """One operand of the joined node, for all parts together; None where it cannot be joined.
+
+        An activation is not taken from products that stay apart: runtimes have the two in one.
         """
         kinds = [self.types[r] for r in given]
         if any(k.shape is None or k.dtype != FLOAT32 for k in kinds):

@@ -22,8 +22,9 @@ def lower_for_nn(graph: Graph, roots: Collection[str] = ()) -> Graph:
 
 
 def lower_for_importers(graph: Graph, misread: Collection[str] = ()) -> Graph:
-    """Return the graph without what becomes one of the ONNX ops ``misread``, or one that no importer of Unity's reads
-    rightly, where an op's entry says how.
+    """Return the graph in ops that every importer of Unity's reads rightly, where an op's entry says how.
+
+    Rewritten, too, is what would become one of the ONNX ops ``misread``.
     """
 
     def rewrite_of(entry: OpDef) -> Tfjs | None:

@@ -30,8 +30,10 @@ def samplers(graph: Graph) -> list[Node]:
 
 
 def clear_seeds(graph: Graph) -> Graph:
-    """Samplers without the seed that the trainer's run had: with it, a game draws the same actions after every start,
-    and TensorFlow.js, which starts its generator anew for every run, the same one each time.
+    """Samplers without the seed that the trainer's run had.
+
+    With it, a game draws the same actions after every start, and TensorFlow.js, which starts its generator anew for
+    every run, the same one each time.
     """
     if not any(traits(n).sampler for n in graph.nodes):
         return graph

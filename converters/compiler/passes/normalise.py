@@ -23,8 +23,10 @@ from signatures.errors import GraphError, UnsupportedOpError
 
 
 def normalise(graph: Graph, keep: Sequence[str] = ()) -> Graph:
-    """See the module; a node in ``keep`` is there under its name afterwards, whatever its op became. Raises
-    UnsupportedOpError that names every node whose op is unknown.
+    """Return the graph in one spelling (see the module).
+
+    A node in ``keep`` is there under its name afterwards, whatever its op became. Raises UnsupportedOpError that names
+    every node whose op is unknown.
     """
     renamed = [replace(n, op=SPELLINGS[n.op]) if n.op in SPELLINGS else n for n in graph.nodes]
     unknown = [n for n in renamed if n.op not in TABLE and n.op not in CONTROL_FLOW]

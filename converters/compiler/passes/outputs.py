@@ -139,8 +139,10 @@ def leave_out_without_rows(c: Compilation) -> Compilation:
 
 
 def _check_memories(c: Compilation) -> None:
-    """An output that is made of an input and has its shape is fed back to it, for all that is known: where another
-    input is the observation, and nobody said what the output is. One that is left out is looked at in the source.
+    """Raise SignatureError for an unnamed output that may be a memory.
+
+    An output that is made of an input and has its shape is fed back to it, for all that is known: where another input
+    is the observation, and nobody said what the output is. One that is left out is looked at in the source.
     """
     fed = [n for n, r in c.roles.items() if r in OBSERVATIONS or r is Role.PARAMETER]
     named = {normal_ref(n) for n in c.options.outputs} | {r for _, role, r in c.brain.outputs if role is not Role.OTHER}

@@ -22,8 +22,9 @@ ROWS = 3
 
 
 def check_rows(graph: Graph, outputs: Sequence[str]) -> None:
-    """Raise SignatureError that names the first output which is wrong for more rows than one, or the first draw that
-    rows share. What is drawn is the same, row by row, in all runs, so that what is behind it is judged, too.
+    """Raise SignatureError where an output is wrong for more rows than one, or rows share a draw.
+
+    It names the first. What is drawn is the same, row by row, in all runs, so that what is behind it is judged, too.
     """
     graph = normalise(graph.prune(outputs), outputs).prune(outputs)
     types = infer_types(graph)

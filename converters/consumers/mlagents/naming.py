@@ -80,10 +80,10 @@ class Dressing(Struct, dict=True):
         self.tensors[self.policy.feeds[spec.name]] = tensor
 
     def take_over(self, draws: Callable[[TensorSpec], str] | None) -> None:
-        """Append the policy's graph behind the inputs; ``draws`` makes what stands for an input of noise (None: zeros,
-        where no draw is wanted).
+        """Append the policy's graph behind the inputs.
 
-        What does not hang on noise comes first, so that a draw can be of the shape of something computed.
+        ``draws`` makes what stands for an input of noise (None: zeros, where no draw is wanted). What does not hang on
+        noise comes first, so that a draw can be of the shape of something computed.
         """
         graph = self.policy.graph
         noise = {self.policy.feeds[s.name]: s for s in self.policy.signature.noise}

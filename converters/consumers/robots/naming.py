@@ -24,8 +24,10 @@ _PARTS = {"h": HIDDEN, "c": CELL}
 
 
 def name_for_isaac_lab(policy: Policy) -> Policy:
-    """The policy as rsl_rl's exporter names it: ``obs`` to ``actions``, the mean; ``h_in``, ``c_in`` to ``h_out``,
-    ``c_out`` [1, 1, size]. Raises ProfileError for actions that are not continuous, and memories of other forms.
+    """The policy as rsl_rl's exporter names it: ``obs`` to ``actions``, the mean.
+
+    A memory is ``h_in``, ``c_in`` to ``h_out``, ``c_out``, [1, 1, size] each. Raises ProfileError for actions that are
+    not continuous, and memories of other forms.
     """
     dressing = Dressing(policy, ISAAC_LAB)
     _take_row(dressing)

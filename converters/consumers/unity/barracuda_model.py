@@ -165,8 +165,10 @@ def _kept_nhwc(file: OnnxFile, name: str) -> bool:
 
 
 def _keeps_all_nhwc(file: OnnxFile) -> bool:
-    """Whether Barracuda 1.3 takes a file for TensorFlow's: a Transpose to NCHW stands between an input, reshaped or
-    not, and a Conv (cases/gray_camera_barracuda-1.0, where two cameras are NCHW and both are taken for NHWC).
+    """Whether Barracuda 1.3 takes a file for TensorFlow's.
+
+    It does where a Transpose to NCHW stands between an input, reshaped or not, and a Conv
+    (cases/gray_camera_barracuda-1.0, where two cameras are NCHW and both are taken for NHWC).
     """
     declared = {i.name for i in file.inputs}
     for node in file.model.graph.node:

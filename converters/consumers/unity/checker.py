@@ -270,8 +270,9 @@ _SAYS = {
 
 
 def _misread(file: OnnxFile, consumer: Consumer) -> tuple[Finding, ...]:
-    """The constructs of a file that its importer does not read rightly: one finding per kind, with its places; empty
-    where the shapes of the file contradict each other. Most of them give no error at all.
+    """The constructs of a file that its importer does not read rightly: one finding per kind, with its places.
+
+    Most of these give no error in Unity. Empty where the shapes of the file contradict each other.
     """
     if file.has_negative_lengths:
         return ()  # ONNX's shape inference would abort the process

@@ -19,8 +19,9 @@ _ABSENT = "mem_out_missing, cont_missing_drawn, disc_missing_drawn"
 
 
 class Played(Struct, frozen=True):
-    """One thing that comes of playing a model: ``exception`` in Unity's words where it throws, ``evidence`` the small
-    models that it was measured with.
+    """One thing that comes of playing a model.
+
+    ``exception`` is Unity's text where it throws, ``evidence`` the small models that it was measured with.
     """
 
     outcome: Outcome

@@ -19,8 +19,10 @@ _INTEGERS = frozenset({2, 3, 4, 5, 6, 7, 9, 12, 13})  # TensorProto.DataType
 
 
 class Port(Struct, frozen=True):
-    """An input or an output. ``dims`` has the batch first and None for a free length; it is None where nobody says it
-    (outputs of a ``.nn``). ``view`` is there for inputs. ``sensor`` is the shape that is written into an observation.
+    """An input or an output.
+
+    ``dims`` has the batch first and None for a free length; it is None where nobody says it (outputs of a ``.nn``).
+    ``view`` is there for inputs. ``sensor`` is the shape that is written into an observation.
     """
 
     name: str

@@ -138,11 +138,10 @@ Shape = tuple[int, ...]
 
 
 def failure(file: OnnxFile, consumer: Consumer) -> Thrown | None:
-    """What the run on zeros throws with which ML-Agents 3.0 and later begin, told from types and shapes; None where it
-    runs.
+    """What the run on zeros throws with which ML-Agents 3.0 and later begin; None where it runs.
 
-    Every free length is 1 in it. Nothing is computed here: an input of integers is refused before the run, one of
-    length 0 has no memory, and lengths that do not fit are met by shape inference.
+    It is told from types and shapes, with every free length 1. Nothing is computed here: an input of integers is
+    refused before the run, one of length 0 has no memory, and lengths that do not fit are met by shape inference.
     """
     for index, given in enumerate(file.inputs):
         if not given.is_float:
