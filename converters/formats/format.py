@@ -57,10 +57,16 @@ def defer_imports(room: str, *modules: str) -> list[Any]:
 
 
 class WriteOptions(Struct, frozen=True):
-    """What a writer needs beside the policy: the contract as JSON text, the ONNX opset, the profile's name where the
-    file is made for one consumer (``--for``), whether the result is to be proved valid (ONNX: by its checker), how
-    weights that were rounded are kept, for how many agents the file is (None: for any number), and the ONNX ops that
-    the consumer lacks or misreads in some form; ``code`` is how source code is written.
+    """What a writer needs beside the policy.
+
+    - ``contract``: the contract as JSON text.
+    - ``opset``: of the ONNX.
+    - ``profile``: its name where the file is made for one consumer (``--for``).
+    - ``checked``: whether the result is to be proved valid (ONNX: by its checker).
+    - ``weights``: how weights that were rounded are kept.
+    - ``batch``: for how many agents the file is (None: for any number).
+    - ``misread``: the ONNX ops that the consumer lacks or misreads in some form.
+    - ``code``: how source code is written.
     """
 
     contract: str

@@ -80,11 +80,17 @@ NO_NORMALISER = "none"
 
 
 class ReadOptions(Struct, frozen=True):
-    """What a reader may be told: the checkpoint's step (None: the newest); the shapes of the agent's sensors, in their
-    order, lists of entities [most, numbers], images C, H, W (empty: as far as the source tells); whether a source may
-    be loaded that runs what it says; which of the sensors are goals, by their place; the activation between layers; the
-    file with the statistics that observations were normalised by (None: the one beside the source; ``NO_NORMALISER``:
-    they are left out); the file that states the interface (None: those beside the source; "none": none).
+    """What a reader may be told.
+
+    - ``step``: of the checkpoint (None: the newest).
+    - ``sensors``: the shapes of the agent's sensors, in their order: lists of entities [most, numbers], images C, H, W
+      (empty: as far as the source tells).
+    - ``trust_source``: whether a source may be loaded that runs what it says.
+    - ``goals``: which of the sensors are goals, by their place.
+    - ``activation``: the one between layers.
+    - ``normaliser``: the file with the statistics that observations were normalised by (None: the one beside the
+      source; ``NO_NORMALISER``: they are left out).
+    - ``interface``: the file that states the interface (None: those beside the source; "none": none).
     """
 
     step: int | None = None

@@ -22,8 +22,10 @@ TERMS, LANES = 8, 16
 
 
 class Packed(Struct, frozen=True):
-    """How a constant is cut: the loops over its blocks, outermost first, with how many elements each goes on by, and
-    how far apart the elements of a block lie, from one term and from one lane to the next.
+    """How a constant is cut.
+
+    ``lengths`` and ``steps`` are the loops over its blocks, outermost first, with how many elements each goes on by;
+    ``term`` and ``lane`` are how far apart the elements of a block lie, from one term and from one lane to the next.
     """
 
     place: Place

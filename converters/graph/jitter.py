@@ -40,8 +40,9 @@ class Jitter:
         self._approximations = known[arithmetic]
 
     def operands(self, entry: OpDef, operands: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """What an op reads: every term of a sum of products moved by one unit in its last place; of large operands
-        ``_added_up`` knows what comes of that.
+        """What an op reads: every term of a sum of products, moved by one unit in its last place.
+
+        Large operands stay: ``_added_up`` knows what comes of moving them.
         """
         if entry.precision != "summed":
             return list(operands)
@@ -112,8 +113,10 @@ class Jitter:
 
 
 def _piecewise(move: Callable[..., np.ndarray], *arrays: np.ndarray) -> np.ndarray:
-    """What ``move`` makes of arrays of one shape, element by element, in their order; of large ones a piece at a time,
-    so that what it takes on the way is never held for all of them. Chance comes in the order of the elements.
+    """What ``move`` makes of arrays of one shape, element by element, in their order.
+
+    Large ones are moved a piece at a time, so that what it takes on the way is never held for all of them. Chance comes
+    in the order of the elements.
     """
     first = arrays[0]
     if first.size <= _AT_ONCE or not all(a.flags.c_contiguous and a.shape == first.shape for a in arrays):

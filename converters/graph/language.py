@@ -49,8 +49,10 @@ def lines_of(words: Sequence[str]) -> str:
 
 
 class Language(ABC):
-    """The words of a programming language; ``helpers`` are the functions that a program brings along, by name, each
-    after those that it calls. ``own``: mathematical functions are ours, and every result is rounded to its dtype.
+    """The words of a programming language.
+
+    ``helpers`` are the functions that a program brings along, by name, each after those that it calls. ``own``:
+    mathematical functions are ours, and every result is rounded to its dtype.
     """
 
     #: Function of float32 → how it is written; ``{0}`` and ``{1}`` are the operands.

@@ -173,8 +173,10 @@ def elements_of(kind: TensorType) -> int:
 
 
 def numbers_made(graph: Graph, rows: int) -> int:
-    """How many numbers the kernels make of a straight graph for so many rows: all results, and the windows that a
-    convolution looks at. A free axis counts as ``rows``: who computes what a file declares asks this first.
+    """How many numbers the kernels make of a straight graph for so many rows.
+
+    These are all results, and the windows that a convolution looks at. A free axis counts as ``rows``: who computes
+    what a file declares asks this first.
     """
     types, total = infer_types(graph), 0
     for node in graph.nodes:

@@ -54,8 +54,9 @@ def action_meaning(graph: Graph, reference: str, dtype: np.dtype, has_masks: boo
 
 
 def _without_gumbel(graph: Graph, scores: str) -> str | None:
-    """The logits, where ``scores`` are logits − log(−log(u)) of a uniform u: their argmax is a draw (OpenAI Baselines,
-    CategoricalPd.sample). None where they are not.
+    """The logits, where ``scores`` are logits − log(−log(u)) of a uniform u; None where they are not.
+
+    The argmax of such scores is a draw (OpenAI Baselines, CategoricalPd.sample).
     """
     node = graph.producer(scores)
     if node.op == "Sub":

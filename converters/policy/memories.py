@@ -123,8 +123,10 @@ def looks_like_state(name: str) -> bool:
 
 
 def _words(name: str) -> list[str]:
-    """``"stateOut_0"`` as state, out, 0; ``"h0"`` and ``"hn"`` as h (PyTorch's names for a step's two ends), but
-    ``"h1_in"`` as h1, in: the first of several.
+    """The words of a name: ``"stateOut_0"`` is state, out, 0.
+
+    ``"h0"`` and ``"hn"`` are h (PyTorch's names for a step's two ends), but ``"h1_in"`` is h1, in: the first of
+    several.
     """
     base = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", node_of(name).rsplit("/", 1)[-1])
     words = [w for w in re.split(r"[^a-z0-9]+", base.lower()) if w]

@@ -22,8 +22,9 @@ _MASKS = "action_masks"
 
 
 def with_slices(model: NnModel) -> tuple[NnModel, tuple[str, ...]]:
-    """(the model with its slices, what the user should know); as it is where nothing is missing or it cannot be told
-    where.
+    """Return (the model with its slices, what the user should know).
+
+    The model stays as it is where nothing is missing, or where it cannot be told where the slices belong.
     """
     layers = {layer.name: layer for layer in model.layers}
     total, parts = model.number(ACTION_SHAPE), _parts(layers)

@@ -46,8 +46,9 @@ def bundles_in(place: Path) -> list[Path]:
 
 
 def other_folders_in(place: Path) -> tuple[list[Path], list[Path]]:
-    """Return (folders in ``place`` with a report and no contract, which are bundles that lost it, all others that are
-    not bundles), by name.
+    """Return (folders in ``place`` that lost their contract, all other folders that are not bundles), by name.
+
+    A folder that lost its contract has a report and no policy.json.
     """
     if not place.is_dir() or (place / POLICY).is_file():
         return [], []

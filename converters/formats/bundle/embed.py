@@ -115,8 +115,10 @@ def facts_of(graph: Graph, contract: Contract | None, nodes: Mapping[str, str] |
 
 
 def _separate_memories(contract: Contract, nodes: Mapping[str, str]) -> tuple[SeparateMemory, ...]:
-    """The parts of a memory in several tensors, or of three axes in a file for a fixed number of agents, whose batch
-    axis its shape does not tell; none of others, which their role tells.
+    """The parts of a memory whose batch axis the role of its tensors does not tell; none of other memories.
+
+    These are the parts of a memory in several tensors, or of three axes in a file for a fixed number of agents, where
+    the shape does not tell the axis either.
     """
     signature = contract.signature
     states = [signature.input(taken) for taken, _ in signature.recurrences]

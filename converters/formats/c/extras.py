@@ -1,5 +1,6 @@
-"""Parts of a header that only some options ask for, or that say what the contract says: constants, weights in a file,
-and which observations are unusual.
+"""Parts of a header that only some options ask for, or that say what the contract says.
+
+They are constants, weights in a file, and which observations are unusual.
 """
 
 from __future__ import annotations

@@ -21,8 +21,10 @@ from signatures.errors import DamagedFileError, RuntimeUnavailableError, SourceE
 
 
 class Stored(Struct, frozen=True):
-    """What an HDF5 file of Keras holds: (layer, name) → array, in its order, what an ``.h5`` says of itself, and
-    the first names in it.
+    """Content of an HDF5 file of Keras.
+
+    ``arrays`` are (layer, name) → array, in the file's order; ``config``, ``version`` and ``training`` are what an
+    ``.h5`` says of itself, and ``names`` the first names in it.
     """
 
     arrays: dict[tuple[str, str], np.ndarray]

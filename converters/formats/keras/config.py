@@ -156,8 +156,10 @@ def _of_keras(module: str, rooms: frozenset[str]) -> bool:
 
 
 def _objects(config: Any, *, built: bool = False) -> Iterator[tuple[str, dict[str, Any]]]:
-    """(where, what) of every object of a configuration that names a class, or should; what training alone uses only if
-    it is built. Where it is: ``the activation of its layer 'action'``; empty where that is not known.
+    """(where, what) of every object of a configuration that names a class, or should.
+
+    What training alone uses is only looked at if it is ``built``. Where an object is reads ``the activation of its
+    layer 'action'``; it is empty where that is not known.
     """
     stack = [("", "", config)]
     while stack:

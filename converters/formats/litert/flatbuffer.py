@@ -54,8 +54,10 @@ class _Piece:
 
 
 class _Writer:
-    """An offset says how much farther on something is, so tables stand before what they lead to, and what several lead
-    to, which leads nowhere itself, stands behind all of them.
+    """The pieces of a file, in an order that its offsets allow.
+
+    An offset says how much farther on something is, so tables stand before what they lead to. What several lead to,
+    which leads nowhere itself, stands behind all of them.
     """
 
     def __init__(self) -> None:

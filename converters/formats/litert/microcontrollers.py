@@ -80,9 +80,10 @@ def _faults(model: Table, subgraph: Table, operator: Table) -> list[str]:
 
 
 def _planned_bytes(subgraph: Table, *, runs: bool) -> int:
-    """Bytes of the tensors that are computed, as a planner lays them: the largest first, each as low as it can lie
-    beside those that are needed while it is (``GreedyMemoryPlanner``). Those of the signature that is not called (the
-    second) lie side by side.
+    """Bytes of the tensors that are computed, as ``GreedyMemoryPlanner`` lays them.
+
+    The largest is laid first, each as low as it can lie beside those that are needed while it is. Those of the
+    signature that is not called (the second) lie side by side.
     """
     first: dict[int, int] = {int(i): 0 for i in subgraph.get("inputs", ())}
     last: dict[int, int] = dict.fromkeys(first, 0)

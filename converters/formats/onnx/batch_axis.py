@@ -31,8 +31,10 @@ Dims = tuple[int | None, ...] | None
 
 
 class Reading(Struct, frozen=True):
-    """A model as it is read. ``batch`` is the number of rows that the file itself takes, None: any; ``alone``: it was
-    made for one agent, and the graph computes each agent's row by itself.
+    """A model as it is read.
+
+    ``batch`` is the number of rows that the file itself takes, None: any; ``alone``: it was made for one agent, and the
+    graph computes each agent's row by itself.
     """
 
     importer: Importer
@@ -54,10 +56,11 @@ def read_rows(
     ends: Mapping[str, int],
     nodes: Sequence[Any],
 ) -> Reading:
-    """Return the reading that is right of a model with ``nodes``; ``axes`` and ``ends`` are the batch axes of memories,
-    by input and by output. Inputs that are handed on as they came say nothing of rows: godot_rl's exporter may fix
-    ``state_ins`` alone to one number. Raises what ``_import_nodes`` raises, SignatureError where the model
-    gives one row only and no reading gives more.
+    """Return the reading that is right of a model with ``nodes``.
+
+    ``axes`` and ``ends`` are the batch axes of memories, by input and by output. Inputs that are handed on as they came
+    say nothing of rows: godot_rl's exporter may fix ``state_ins`` alone to one number. Raises what ``_import_nodes``
+    raises, SignatureError where the model gives one row only and no reading gives more.
     """
     asked, judged = _without_echoes(declared, outputs, nodes)
     batch = _fixed_batch(asked, axes)
@@ -117,8 +120,9 @@ def _alone(
     *,
     leading: bool,
 ) -> Reading:
-    """The model for one agent, computed for each; ``leading``: a first axis of 1 is that of the agents. Raises
-    UnsupportedOpError where it cannot be.
+    """The model for one agent, computed for each.
+
+    ``leading``: a first axis of 1 is that of the agents. Raises UnsupportedOpError where it cannot be.
     """
     importer = imported(None, True)
     made = _imported_outputs(importer, outputs)
@@ -209,9 +213,10 @@ def dims_of(value: Any) -> Dims:
 
 
 def _fault(importer: Importer, outputs: Sequence[Any], *, said: bool = False) -> SignatureError | None:
-    """The error that names the first output which is wrong for more rows than one, or draw that they share; ``said``:
-    the file says that it takes one row, so that one too large to be tried is believed. Else SignatureError is raised
-    for it.
+    """The error that names the first output which is wrong for more rows than one, or the first draw that rows share.
+
+    ``said``: the file says that it takes one row, so that one too large to be tried is believed. Else SignatureError is
+    raised for it.
     """
     if too_large(importer.graph()):
         if said:

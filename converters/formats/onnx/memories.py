@@ -43,8 +43,10 @@ class OnnxMemory(Struct, frozen=True):
 
 
 class Start(Struct, frozen=True):
-    """An input that recurrent layers begin with: (layer, part) of each, the outputs that give the last of the same
-    states and may have its shape, and its batch axis, where they tell it.
+    """An input that recurrent layers begin with.
+
+    ``states`` are (layer, part) of each, ``ends`` the outputs that give the last of the same states and may have its
+    shape, and ``axis`` is its batch axis, where they tell it.
     """
 
     states: frozenset[tuple[int, str]]

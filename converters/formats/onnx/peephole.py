@@ -18,10 +18,11 @@ from converters.formats.onnx import messages
 def simplify_nodes(
     nodes: Sequence[Any], constants: Mapping[str, np.ndarray], ranks: Mapping[str, int], outputs: Collection[str]
 ) -> list[Any]:
-    """The nodes with Clip for a Max of a Min, LeakyRelu for the larger of a tensor and a part of it, and ArgMax as a
-    column for one that is reshaped to a column.
+    """The nodes with one op in place of some pairs.
 
-    ``constants`` are the initializers' values by name, ``ranks`` the number of axes of the values that it is known of.
+    Clip stands for a Max of a Min, LeakyRelu for the larger of a tensor and a part of it, and ArgMax as a column for
+    one that is reshaped to a column. ``constants`` are the initializers' values by name, ``ranks`` the number of axes
+    of the values that it is known of.
     """
     reads = Counter(name for node in nodes for name in node.input)
     makers = {name: node for node in nodes for name in node.output}

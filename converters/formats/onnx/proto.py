@@ -182,8 +182,10 @@ def _is_set(attribute: Any, field: str) -> bool:
 
 
 def inside(message: Any, kind: str) -> Iterator[Any]:
-    """Every message of a kind in another, wherever it stands: in attributes, subgraphs, defaults of a function's
-    attributes. What is in a TensorProto is not looked at.
+    """Every message of a kind in another, wherever it stands.
+
+    It may be in attributes, in subgraphs, or in defaults of a function's attributes. What is in a TensorProto is not
+    looked at.
     """
     stack = [message]
     while stack:
@@ -220,8 +222,10 @@ def load_external(
     detached: Detached | None = None,
     read: Callable[..., bytes | memoryview] = read_bytes,
 ) -> list[Path]:
-    """Bring data that lies in files beside the model into the tensors of its graph and functions (large ones are
-    ``detached``); returns the files. ``read`` opens one, as ``read_bytes`` does.
+    """Bring data that lies in files beside the model into its tensors; returns the files.
+
+    The tensors are those of its graph and functions (large ones are ``detached``). ``read`` opens a file, as
+    ``read_bytes`` does.
 
     Raises DamagedFileError where a file is missing, too short, or outside of ``folder``, or all are too large.
     """

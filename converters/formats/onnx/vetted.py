@@ -106,8 +106,10 @@ def flat(path: Path, wanted: Sequence[str]) -> bytes:
 
 
 def _computes(domain: str, kind: str, own: Set[tuple[str, str]]) -> bool:
-    """Whether an op computes and does no more. A function that the file has in the runtime's domain does not count: the
-    runtime takes its own operator of that name.
+    """Whether an op computes and does no more.
+
+    A function that the file has in the runtime's domain does not count: the runtime takes its own operator of that
+    name.
     """
     if domain == _OWN:
         return kind in COMPUTING

@@ -100,8 +100,10 @@ class _Builder:
         return tuple(names)
 
     def _sunk(self, op: str, inputs: Sequence[str], attributes: Mapping[str, Any]) -> str:
-        """A node behind transposes put in front of them, empty where that is not to be done: two that undo each other
-        are none. Between the convolutions of a policy none is left; old importers lose their way in them.
+        """A node behind the transposes in front of it, which sink below it; empty where that is not to be done.
+
+        Two that undo each other are none. Between the convolutions of a policy none is left; old importers lose their
+        way in them.
         """
         turned = [self._transposed[i] for i in inputs if i in self._transposed]
         if op == "Transpose" and turned:
@@ -255,8 +257,10 @@ def _value_info(spec: TensorSpec, batch: int | None) -> Any:
 
 
 def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
-    """The ONNX artefact. Raises UsageError on an opset outside 13–21, UnsupportedOpError on ops without a lowering,
-    GraphError when the checker refuses the result (a fault of this tool).
+    """The ONNX artefact.
+
+    Raises UsageError on an opset outside 13–21, UnsupportedOpError on ops without a lowering, GraphError when the
+    checker refuses the result (a fault of this tool).
     """
     if options.opset not in (IR_VERSIONS if options.profile else ASKED_FOR):
         raise UsageError(

@@ -1,5 +1,7 @@
-"""The constants of a program as they are kept: in float32 or, where they were rounded to that, in float16 or in int8
-with the length of a step for each channel; in the source, or in one little-endian file that all languages load.
+"""The constants of a program as they are kept.
+
+They are in float32 or, where they were rounded to that, in float16 or in int8 with the length of a step for each
+channel; they stand in the source, or in one little-endian file that all languages load.
 """
 
 from __future__ import annotations

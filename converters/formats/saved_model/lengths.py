@@ -1,5 +1,6 @@
-"""Inputs of which only the number of agents is read: TF-Agents counts ``discount`` and ``step_type``. An input that the
-policy looks at says that, too, and nobody has to feed what nothing depends on.
+"""Inputs of which only the number of agents is read: TF-Agents counts ``discount`` and ``step_type``.
+
+An input that the policy looks at says that, too, and nobody has to feed what nothing depends on.
 """
 
 from __future__ import annotations

@@ -60,8 +60,10 @@ def _fill(entries: Any, specs: Iterable[TensorSpec]) -> None:
 
 
 def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
-    """The SavedModel artefact. Its graph is that of the ``.bytes``, put between the other fields as it was serialised;
-    protobuf is given it again where the weights become variables.
+    """The SavedModel artefact.
+
+    Its graph is that of the ``.bytes``, put between the other fields as it was serialised; protobuf is given it again
+    where the weights become variables.
     """
     graph = frozen_graph(policy, options.contract, options.weights)
     about, signed = schema.MetaGraphDef(), schema.MetaGraphDef()

@@ -1,8 +1,8 @@
-"""An artefact that is a TensorFlow.js graph model: what it takes and gives, by its signature, its inner tensors, what
-of it a runtime may be given.
+"""An artefact that is a TensorFlow.js graph model.
 
-Its loader reads whatever path the manifest names: the copy for a runtime has its weights in files of our own names,
-control inputs left out, and no op but those that compute.
+What it takes and gives, by its signature, its inner tensors, and what of it a runtime may be given. Its loader reads
+whatever path the manifest names: the copy for a runtime has its weights in files of our own names, control inputs left
+out, and no op but those that compute.
 """
 
 from __future__ import annotations

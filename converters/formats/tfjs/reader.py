@@ -46,8 +46,9 @@ class WebModel(Struct, frozen=True):
 
 
 def model_file(path: Path) -> Path:
-    """The JSON file of a model: ``path``, or in a folder model.json, else the one file that is such (no other name is
-    agreed on: ``model.save('downloads://walker')`` writes walker.json).
+    """The JSON file of a model: ``path``, or in a folder model.json, else the one file that is such.
+
+    No other name is agreed on: ``model.save('downloads://walker')`` writes walker.json.
     """
     if not path.is_dir():
         return path

@@ -53,8 +53,10 @@ class _Input(Struct, frozen=True):
 
 
 def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
-    """The one policy of a module. Raises SourceError, UnsupportedOpError for what is outside of the known, UsageError,
-    DamagedFileError, NotAPolicyError.
+    """The one policy of a module.
+
+    Raises SourceError, UnsupportedOpError for what is outside of the known, UsageError, DamagedFileError,
+    NotAPolicyError.
     """
     archive = ScriptArchive(given.data)
     if not isinstance(archive.value, Instance):

@@ -24,8 +24,10 @@ def _concat(op: Op, net: Importer) -> str:
 
 
 def _split(op: Op, net: Importer) -> list[str | None]:
-    """Lengths: an attribute before opset 13, an input from there on; without them equal parts (the last one shorter
-    from opset 18 on).
+    """The parts of a tensor, by the lengths that the op gives.
+
+    They are an attribute before opset 13, an input from there on; without them the parts are equal (the last one
+    shorter from opset 18 on).
     """
     x = op.need(0)
     axis = net.axis(x, op.integer("axis", 0))
