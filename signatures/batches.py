@@ -16,8 +16,9 @@ Run = Callable[[Arrays, Sequence[str]], dict[str, npt.NDArray[Any]]]
 
 
 def batches_of(feeds: Arrays, size: int, batched: Collection[str]) -> list[dict[str, npt.NDArray[Any]]]:
-    """``feeds`` in parts of ``size`` agents, the last agent repeated to fill the last; ``batched`` are those that have
-    the agents' axis.
+    """``feeds`` in parts of ``size`` agents, the last agent repeated to fill the last.
+
+    ``batched`` are those that have the agents' axis.
     """
     rows = rows_of(feeds, batched)
     parts = max(1, -(-rows // size))

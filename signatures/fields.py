@@ -219,7 +219,9 @@ def _word(leaf: Mapping[str, Any]) -> str:
 
 
 def printable(text: str, keep: str = "") -> str:
-    """The text with U+FFFD for what cannot be printed: controls (a terminal obeys them), C1, what turns the direction
-    of writing, lone surrogates. Characters in ``keep`` stay.
+    """The text with U+FFFD for what cannot be printed.
+
+    That is controls (a terminal obeys them), C1, what turns the direction of writing, lone surrogates. Characters in
+    ``keep`` stay.
     """
     return text if text.isprintable() else "".join(c if c.isprintable() or c in keep else "\ufffd" for c in text)

@@ -67,9 +67,11 @@ class TensorSpec(Record, frozen=True):
 
 
 class Memory(Record, frozen=True):
-    """Recurrent state: ``size`` floats per agent, fed as ``input`` and read from ``output`` (None where the source
-    has lost it). ``layout`` names its parts in order, for example ``("c", "h")``, or is empty where it is unknown.
-    ``others`` are further (input, output) pairs of a memory in several tensors, a part of ``layout`` each.
+    """Recurrent state: ``size`` floats per agent, fed as ``input`` and read from ``output``.
+
+    ``output`` is None where the source has lost it. ``layout`` names its parts in order, for example ``("c", "h")``, or
+    is empty where it is unknown. ``others`` are further (input, output) pairs of a memory in several tensors, a part of
+    ``layout`` each.
     """
 
     size: Size

@@ -1,10 +1,9 @@
-"""What is fetched and kept (npm packages, old TensorFlow libraries): where it lies, how it gets there whole, and that
-each time it is used it is what was known when this version was made.
+"""What is fetched and kept (npm packages, old TensorFlow libraries): where it lies, and how it gets there whole.
 
-What is looked at is the sha256 of every file that is loaded. It is not computed again for a file that has not changed
-since it was found right: its size, its inode, and the times of its last change, of which ``ctime`` is the system's own.
-A folder that a cache brought back, or somebody wrote to, is read again. It is no help against who can write as the
-user: that one needs no part of ours.
+Each time it is used it is proved to be what was known when this version was made, by the sha256 of every file that is
+loaded. That is not computed again for a file that has not changed since it was found right: its size, its inode, and
+the times of its last change, of which ``ctime`` is the system's own. A folder that a cache brought back, or somebody
+wrote to, is read again. It is no help against who can write as the user: that one needs no part of ours.
 """
 
 from __future__ import annotations

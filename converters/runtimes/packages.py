@@ -20,10 +20,11 @@ def package_runtime(
     package: str = "",
     child: tuple[str, ...] = (),
 ) -> Runtime:
-    """The runtime of the ``package`` (which is called as it is), whose child is the module ``child`` of the folder of
-    that name here; ``child`` names another folder and what its module is told.
+    """The runtime of a Python ``package`` (called ``name`` where it is empty), in a child process.
 
-    Several of the ``distributions`` may provide the package: the first that is installed tells the version.
+    The child is the module ``child`` of the folder of that name here; ``child`` names another folder and what its
+    module is told. Several of the ``distributions`` may provide the package: the first that is installed tells the
+    version.
     """
     folder, *told = child or (name,)
     command = partial(child_command, f"converters.runtimes.{folder}.child", *told)

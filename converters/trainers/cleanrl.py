@@ -37,7 +37,9 @@ _Outputs = dict[str, Role | None]
 
 
 class _Script(Struct, frozen=True):
-    """A kind of script: the names that tell it, what it is called, what builds it, and the activation that the scripts
+    """A kind of script.
+
+    ``names`` tell it, ``algorithm`` is what it is called, ``build`` builds it, and ``activation`` is what the scripts
     in ``evidence`` have between their layers; empty: no script has these names.
     """
 

@@ -73,7 +73,9 @@ class Rebuilt(Struct, frozen=True):
 
 
 class Trainer(Struct, frozen=True):
-    """- ``label``: what people call it.
+    """A trainer whose state dictionaries are known.
+
+    - ``label``: what people call it.
     - ``recognise`` looks at what was saved and gives what it found, for ``rebuild``; None where another wrote it.
     - ``rebuild`` gives the policy. It raises SourceError for parts that are not known, DamagedFileError, UsageError for
       options that do not fit.

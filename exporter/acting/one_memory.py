@@ -15,8 +15,9 @@ TAKEN, GIVEN = CANONICAL[Role.MEMORY_IN], CANONICAL[Role.MEMORY_OUT]
 
 
 def with_one_memory(signature: PolicySignature, run: Run) -> tuple[PolicySignature, Run]:
-    """The signature with ``recurrent_in`` and ``recurrent_out`` [agents, size], and ``run`` for it; both as they are
-    where the memory is a single tensor.
+    """The signature with ``recurrent_in`` and ``recurrent_out`` [agents, size], and ``run`` for it.
+
+    Both are as they were where the memory is a single tensor.
     """
     memory = signature.memory
     if memory is None or not memory.others:

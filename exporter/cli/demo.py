@@ -25,8 +25,9 @@ from exporter.cli.terminal import say
 @click.option("--no-open", is_flag=True, help="Do not open the page; exit once everything is written.")
 @click.option("--files", is_flag=True, help="Write policies to try, and their environments for Gymnasium.")
 def demo_command(out: Path | None, no_open: bool, files: bool) -> None:
-    """Export a trained 3DBall that comes with the package, compare the formats in the installed runtimes, and open
-    the page on which it acts.
+    """Export a trained 3DBall, compare the formats, and open the page on which it acts.
+
+    The policy comes with the package; the formats are compared in the installed runtimes.
     """
     if files:
         _write_files(out or Path())

@@ -37,8 +37,9 @@ def run_fleet(
     fail_fast: bool,
     console: Console,
 ) -> None:
-    """Export what the paths stand for. Ends with status 2 where a source was refused, 1 where formats disagree,
-    3 where nothing was decided.
+    """Export what the paths stand for.
+
+    Ends with status 2 where a source was refused, 1 where formats disagree, 3 where nothing was decided.
     """
     if cluster is not None and jobs is not None:
         raise UsageError("--jobs and --cluster contradict each other", fix="a cluster's workers are as many as it has")

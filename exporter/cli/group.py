@@ -67,8 +67,10 @@ _ALL = "exporter.cli.help_all"
 
 
 class Command(click.Command):
-    """A command whose help has examples, (what is typed, what it does), and its options: those of ``core``, which are
-    parameters, with ``--help``; all of them in groups with ``--help-all``. Without ``core`` both are the same.
+    """A command whose help has examples: (what is typed, what it does).
+
+    Its options are those of ``core``, which are parameters, with ``--help``, and all of them in groups with
+    ``--help-all``. Without ``core`` both are the same.
     """
 
     def __init__(

@@ -157,8 +157,9 @@ def _inspect_source(
     as_json: bool,
     why: bool,
 ) -> dict[str, Any]:
-    """Say what is in a source, and which files of a folder could not be read; return it for a program, for which
-    nothing is printed but errors (``as_json``).
+    """Say what is in a source, and which files of a folder could not be read; return it for a program.
+
+    For a program (``as_json``) nothing is printed but errors.
     """
     from exporter.inspect.inspection import inspect_source, inspection_text
 

@@ -88,8 +88,10 @@ RULES = frozenset(("golden", "sizes", "tolerances", "atol", "rtol", "required"))
 
 
 def sensors_of(text: str | None) -> tuple[tuple[tuple[int, ...], ...], tuple[int, ...]]:
-    """``"8,goal:3,20x4,3x84x84"``: the shapes of a vector, another, a list of entities and an image C, H, W; and the
-    places of those that are goals.
+    """The shapes that ``--sensors`` gives, and the places of those that are goals.
+
+    ``"8,goal:3,20x4,3x84x84"`` is a vector, another that is a goal, a list of entities and an image C, H, W. Raises
+    UsageError.
     """
     parts = [part.strip() for part in (text or "").split(",") if part.strip()]
     for part in parts:

@@ -1,5 +1,7 @@
-"""Candidates whose weights were rounded (``--quantize int8``, ``--dtype float16``): held against the reference with its
-weights rounded alike by numbers, and against the reference itself by what they decide, as export and verify do.
+"""Candidates whose weights were rounded (``--quantize int8``, ``--dtype float16``).
+
+They are held against the reference with its weights rounded alike by numbers, and against the reference itself by what
+they decide, as export and verify do.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""``export-model demo --files``: policies in the forms that a user may have, so that every command can be tried, and
-the environments that policies are trained in, so that other programs can play them.
+"""``export-model demo --files``: policies in the forms that a user may have, so that every command can be tried.
+
+Beside them are the environments that policies are trained in, so that other programs can play them.
 """
 
 from __future__ import annotations

@@ -41,8 +41,10 @@ from signatures.spec import PolicySignature
 
 
 class _Given(Struct, frozen=True):
-    """What a bundle is held against: its source as it was read, and what runs that; or, of a bundle in a consumer's
-    names, the policy made from the source once more.
+    """What a bundle is held against.
+
+    That is its source as it was read, and what runs that; or, of a bundle in a consumer's names, the policy made from
+    the source once more.
     """
 
     source: Source | None = None
@@ -295,8 +297,9 @@ def _whole_graph(graph: Graph, names: Sequence[str], artefacts: Mapping[str, Pat
 
 
 def _outline(signature: PolicySignature, *, noise_kept: bool) -> Graph:
-    """A graph where a bundle has none that we read: what is asked of it is which outputs are drawn. These are samplers,
-    the others constants.
+    """A graph where a bundle has none that we read.
+
+    What is asked of it is which outputs are drawn. These are samplers, the others constants.
     """
     size = Node("size", "Const", value=np.array([1, 1], np.int32))
     nodes = [size]

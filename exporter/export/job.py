@@ -1,5 +1,6 @@
-"""One policy to write: its contract, its artefacts, its weights where they are rounded (``--dtype float16``,
-``--quantize int8``), and what verification is given of it.
+"""One policy to write: its contract, its artefacts, and what verification is given of it.
+
+So, too, its weights where they are rounded (``--dtype float16``, ``--quantize int8``).
 """
 
 from __future__ import annotations
@@ -285,8 +286,9 @@ def bake(job: Job, what: str) -> Job:
 
 
 def fix_batch(job: Job, batch: int, formats: Sequence[Format], flag: str = "--batch") -> Job:
-    """The policy of which some files are for ``batch`` agents at a time, as a note in its contract says, with the
-    ``flag`` that asked for it.
+    """The policy of which some files are for ``batch`` agents at a time.
+
+    A note in its contract says so, with the ``flag`` that asked for it.
     """
     files = " and ".join(f.main_of(job.policy.name) for f in formats if f.fixed)
     note = f"{FIXED_BATCH}{batch}, no more and no fewer ({flag}): {files}"

@@ -58,8 +58,9 @@ class Claim(Struct, frozen=True):
 
 
 class Turns(Struct, Generic[Who]):
-    """Who waits for names: each until all sources before its own have theirs, or have ended without; so names do not
-    depend on who is quick.
+    """Who waits for names: each until all sources before its own have theirs, or have ended without.
+
+    So names do not depend on who is quick.
     """
 
     names: Names

@@ -145,8 +145,10 @@ class Exporter:
         self._labelled_by = printable(Path(options.labels).name) if isinstance(options.labels, Path | str) else "labels"
 
     def check(self, paths: Sequence[Path | str | Source], progress: Progress) -> None:
-        """Raise UsageError where names in ``--labels`` or ``--tolerances`` are nobody's: all sources are compiled ahead
-        for it, where there are such names. What cannot be compiled is left to ``export``.
+        """Raise UsageError where names in ``--labels`` or ``--tolerances`` are nobody's.
+
+        All sources are compiled ahead for it, where there are such names. What cannot be compiled is left to
+        ``export``.
         """
         rules = self.options.parity.rules if self.runtimes else ()
         if not rules and "policies" not in (self._labels or {}):
@@ -167,9 +169,10 @@ class Exporter:
         given: Path | str | Source | None = None,
         refused: list[ExportModelError] | None = None,
     ) -> list[Job]:
-        """The policies of a source, under the names that they will have; ``given`` is what it was called where it is
-        another's copy. Raises ExportModelError; with ``refused``, which gets the errors, only where all of a folder is
-        refused.
+        """The policies of a source, under the names that they will have.
+
+        ``given`` is what it was called where it is another's copy. Raises ExportModelError; with ``refused``, which
+        gets the errors, only where all of a folder is refused.
         """
         options, dress = self.options, self._dress
         progress(f"reading {path.path if isinstance(path, Source) else path}")
@@ -201,8 +204,9 @@ class Exporter:
         return jobs
 
     def write_jobs(self, jobs: Sequence[Job], pool: RuntimePool | None, progress: Progress) -> Iterator[ExportResult]:
-        """Write and verify the policies of a source, in the processes of ``pool`` where any runtime was chosen. Raises
-        ExportModelError, before the first is written if it can.
+        """Write and verify the policies of a source, in the processes of ``pool`` where any runtime was chosen.
+
+        Raises ExportModelError, before the first is written if it can.
         """
         for job in jobs:
             check_free(self.options.out, job.policy.name)
@@ -267,12 +271,12 @@ def export(
     pool: RuntimePool | None = None,
     refused: Callable[[ExportModelError], None] | None = None,
 ) -> Iterator[ExportResult]:
-    """Export every policy of every source, one after the other; a path is read (once, if it is given twice), a Source
-    was read already.
+    """Export every policy of every source, one after the other.
 
-    A source that is refused, or a file of a folder, does not stop the others: ``refused`` is told, by default the
-    errors of all are raised in the end (``RefusedError`` where there are several). A disagreement is in the result, not
-    an exception. A ``pool`` that is given stays open, for callers that export many times.
+    A path is read (once, if it is given twice), a Source was read already. A source that is refused, or a file of a
+    folder, does not stop the others: ``refused`` is told, by default the errors of all are raised in the end
+    (``RefusedError`` where there are several). A disagreement is in the result, not an exception. A ``pool`` that is
+    given stays open, for callers that export many times.
     """
     if not paths:
         raise UsageError("no source was given", fix="export-model FILE -o DIR")

@@ -62,8 +62,9 @@ def compiled_again(found: Source, contract: Contract) -> Job:
 
 
 def _candidates(found: Source, contract: Contract) -> Iterator[tuple[SourceModel, Policy]]:
-    """The source's policies of the bundle's name, or its only one, by each choice of names, noise and chance: a
-    contract does not keep these, but what follows from them.
+    """The source's policies of the bundle's name, or its only one, by each choice of names, noise and chance.
+
+    A contract does not keep these choices, but what follows from them.
     """
     for names, noise, deterministic in product(("canonical", "source"), get_args(NoiseMode), (False, True)):
         compiled = list(found.compile_models(CompileOptions(names=names, noise=noise, deterministic=deterministic)))

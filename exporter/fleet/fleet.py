@@ -43,12 +43,11 @@ def export_fleet(
     cluster: str | None = None,
     wanted: Wanted | None = None,
 ) -> Iterator[Outcome]:
-    """Export every source, ``jobs`` at a time, or by the workers of the Dask cluster at ``cluster``; what ended last
-    comes last.
+    """Export every source, ``jobs`` at a time, or by the workers of the Dask cluster at ``cluster``.
 
-    A source that was exported to the same folder with the same options, and is unchanged, is left out unless ``again``
-    is set. ``fail_fast`` ends with the first source that is refused or disagrees. Raises UsageError,
-    RuntimeUnavailableError before the first source is read; what becomes of a source is in its Outcome.
+    What ended last comes last. A source that was exported to the same folder with the same options, and is unchanged,
+    is left out unless ``again`` is set. ``fail_fast`` ends with the first source that is refused or disagrees. Raises
+    UsageError, RuntimeUnavailableError before the first source is read; what becomes of a source is in its Outcome.
     """
     if jobs < 1:
         raise UsageError(f"--jobs {jobs}: must be 1 or more", fix="leave it out: one at a time")

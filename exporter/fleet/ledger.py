@@ -106,8 +106,9 @@ class Ledger:
 
 
 def state(source: Path) -> State:
-    """What is another as soon as a source is: a run may write a newer checkpoint while this one is exported. None where
-    nothing tells. Raises SourceError.
+    """The state of a source, which is another as soon as the source is; None where nothing tells.
+
+    A run may write a newer checkpoint while this one is exported. Raises SourceError.
     """
     if remote(source) is not None:
         return version(source)
@@ -118,8 +119,9 @@ def state(source: Path) -> State:
 
 
 def stamps(source: Path, files: Iterable[Path]) -> dict[str, Stamp]:
-    """What tells whether the files of a source here are as they are now; of one at an address its state does. Raises
-    OSError.
+    """The stamps that tell whether the files of a source here are as they are now.
+
+    Of a source at an address its state tells that. Raises OSError.
     """
     if address_of(source) is not None:
         return {}

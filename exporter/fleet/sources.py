@@ -101,8 +101,9 @@ def _expand(path: Path, out: Path, others: list[Path]) -> Iterator[Path]:
 
 
 def _matching(pattern: Path, out: Path, others: list[Path]) -> Iterator[Path]:
-    """What a pattern finds; of a folder that is a source itself, nothing that lies in it. ``others`` gets the files
-    that are not models.
+    """The sources that a pattern finds; of a folder that is a source itself, nothing that lies in it.
+
+    ``others`` gets the files that are not models.
     """
     whole: set[Path] = set()
     for match in sorted(set(_glob(pattern))):
@@ -141,8 +142,10 @@ def _glob(pattern: Path) -> Iterator[Path]:
 
 
 def _is_list(path: Path) -> bool:
-    """Whether a file is a list of sources: text whose lines could be paths, one of which at least is there or ends as a
-    file's name does. Any other ``.txt`` is read by its content, as every file is.
+    """Whether a file is a list of sources.
+
+    That is text whose lines could be paths, one of which at least is there or ends as a file's name does. Any other
+    ``.txt`` is read by its content, as every file is.
     """
     if path.suffix != ".txt" or not path.is_file():
         return False

@@ -25,8 +25,10 @@ from signatures.errors import ExportModelError, RefusedError, SourceError
 
 
 class Written(Struct, frozen=True):
-    """A policy of many, written; ``entry`` where reports were asked for, ``failure`` where formats disagree,
-    ``undecided`` why nothing was decided.
+    """A policy of many, written.
+
+    ``entry`` is there where reports were asked for, ``failure`` where formats disagree; ``undecided`` says why nothing
+    was decided.
     """
 
     name: str

@@ -146,8 +146,9 @@ def _by_branch(target: Target, scores: Array, choices: Array) -> list[tuple[Arra
 
 
 class Clip(Struct, frozen=True):
-    """``bounds``, [2, columns], between which a graph clips the action that it draws (infinite where it does not), and
-    the standard deviation that is ``usual`` for each column.
+    """How a graph clips the action that it draws.
+
+    ``bounds``, [2, columns], are infinite where it does not; ``usual`` is the standard deviation for each column.
     """
 
     bounds: Array
@@ -155,8 +156,9 @@ class Clip(Struct, frozen=True):
 
 
 class Likelihood(Struct, frozen=True):
-    """Of each step, float64 [steps]: the log-likelihood of what was drawn, what is expected of it, and its variance;
-    of choices also whether the likeliest was taken, less its odds, and the variance of that.
+    """The log-likelihood of what was drawn in each step, what is expected of it, and its variance: float64 [steps].
+
+    Of choices also whether the likeliest was taken, less its odds, and the variance of that.
     """
 
     found: Array
@@ -196,8 +198,10 @@ def _sigmas(apart: float, variance: float) -> float:
 def likelihood(
     target: Target, logged: Array, answers: Arrays, moved: Sequence[Arrays], clip: Clip | None
 ) -> Likelihood:
-    """Of draws. ``moved``: the answers with the noise at ±``NOISE_STEP``, for an action that the graph draws;
-    ``clip``: how the graph clips it.
+    """The likelihood of logged draws.
+
+    ``moved``: the answers with the noise at ±``NOISE_STEP``, for an action that the graph draws; ``clip``: how the
+    graph clips it.
     """
     if target.branches:
         assert target.scores is not None

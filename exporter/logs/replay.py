@@ -37,8 +37,10 @@ class Replay(Struct, frozen=True):
     fetch: tuple[str, ...]
 
     def answers(self, inputs: Arrays, before: Array, last: Array, use: MemoryUse = MemoryUse.KEPT) -> dict[str, Array]:
-        """The outputs, [rows, …]. ``inputs`` that hold the memory are fed as they are; without, it is fed back as
-        ``use`` says, along ``before`` (or ``last``).
+        """The outputs, [rows, …].
+
+        ``inputs`` that hold the memory are fed as they are; without, it is fed back as ``use`` says, along ``before``
+        (or ``last``).
         """
         pair = self.signature.recurrence
         if pair is None or pair[0] in inputs:
@@ -57,9 +59,10 @@ class Replay(Struct, frozen=True):
         return {n: np.concatenate([p[n] for p in parts]) for n in fetch}
 
     def _step_by_step(self, inputs: Arrays, before: Array, use: MemoryUse, taken: str, given: str) -> dict[str, Array]:
-        """Stretches of an episode side by side, each from the memory that the stretch before left when it was last
-        run; those whose memory has changed since run again, until none has. Stretch n is right after n runs, so that
-        no step is computed otherwise than one after the other; a memory that forgets is right after two or three.
+        """Run stretches of an episode side by side, each from the memory that the one before left when it was last run.
+
+        Those whose memory has changed since run again, until none has. Stretch n is right after n runs, so that no step
+        is computed otherwise than one after the other; a memory that forgets is right after two or three.
         """
         spec = self.signature.input(taken)
         rows = len(before)

@@ -42,8 +42,10 @@ DEEP, EPISODES = 24, 16
 
 
 class Explanation(Struct, frozen=True):
-    """``causes``, in the order in which they are applied, and the verdict on all steps with them; ``others`` explain
-    as much. ``whole``: no step is left but for a hiccup.
+    """An explanation of the steps that differ.
+
+    ``causes`` stand in the order in which they are applied, ``verdict`` is that on all steps with them; ``others``
+    explain as much. ``whole``: no step is left but for a hiccup.
     """
 
     causes: tuple[Cause, ...]

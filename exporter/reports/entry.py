@@ -69,8 +69,9 @@ def of_result(result: ExportResult, steps: int, words: Sequence[str] = ()) -> En
 
 
 def of_bundle(report: ParityReport, folder: Path, place: Path | None, steps: int, words: Sequence[str] = ()) -> Entry:
-    """The entry of a bundle that was verified again (so its files are what policy.json says); ``place``: the
-    address that it was fetched from; ``words``: options to verify it again with.
+    """The entry of a bundle that was verified again (so its files are what policy.json says).
+
+    ``place``: the address that it was fetched from; ``words``: options to verify it again with.
     """
     found = Bundle.open(folder)
     try:

@@ -79,8 +79,9 @@ class Gallery(Struct, frozen=True):
 
 
 def assemble_gallery(folders: Sequence[Path], *, whole: bool) -> Gallery:
-    """The gallery of bundles; ``whole``: each page a site in a folder, else one file. A brain whose opponent is shown
-    plays on that page. Raises the first BundleError where none can be shown.
+    """The gallery of bundles; ``whole``: each page a site in a folder, else one file.
+
+    A brain whose opponent is shown plays on that page. Raises the first BundleError where none can be shown.
     """
     make: Callable[[Path], Mapping[str, bytes]] = assemble if whole else _as_file
     files: dict[str, bytes] = {STYLE: _CSS.encode(), "icon.svg": (PAGE / "icon.svg").read_bytes()}

@@ -128,10 +128,10 @@ class SiteServer(ThreadingHTTPServer):
 
 @contextmanager
 def interrupts() -> Iterator[list[int]]:
-    """What Ctrl-C and SIGTERM have told so far, which then are no errors; whatever was inherited: a job in the
-    background ignores SIGINT unless it says otherwise.
+    """What Ctrl-C and SIGTERM have told so far, which then are no errors.
 
-    A list, not an exception: Python loses one that is raised in a destructor, and the server would go on for ever.
+    So it is whatever was inherited: a job in the background ignores SIGINT unless it says otherwise. The result is a
+    list, not an exception: Python loses one that is raised in a destructor, and the server would go on for ever.
     """
     told: list[int] = []
     numbers = (signal.SIGINT, signal.SIGTERM)

@@ -118,8 +118,9 @@ def _with_picture(page: bytes, address: str) -> bytes:
 
 
 def assemble_one_file(folder: Path, scene: str = AUTO, *, picture: str | None = None) -> bytes:
-    """The page as one HTML file, which needs no server and no network, on its own kernels; ``picture`` lies beside it,
-    for messengers that show one with a link. Raises as ``assemble``, and DamagedFileError.
+    """The page as one HTML file, which needs no server and no network, on its own kernels.
+
+    ``picture`` lies beside it, for messengers that show one with a link. Raises as ``assemble``, and DamagedFileError.
     """
     from exporter.serve.onefile import one_file
 

@@ -17,8 +17,9 @@ from signatures.errors import BundleError, UsageError
 
 
 class Target(Struct, frozen=True):
-    """One way to call a policy: its name for ``--for``, title, language, and the formats it needs: any of them, or of
-    several that it needs together.
+    """One way to call a policy.
+
+    ``name`` is the one for ``--for``; ``needs`` are the formats: any of them, or of several that it needs together.
     """
 
     name: str

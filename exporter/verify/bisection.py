@@ -41,8 +41,10 @@ Rounding = Callable[[Graph, Feeds, str], np.ndarray]
 
 
 class Bisector:
-    """Bisects the failures of one policy. ``agrees`` says whether a graph, run by the numpy kernels, is right;
-    ``rounding`` what it explains, in a runtime, of a tensor of a graph for inputs.
+    """Bisects the failures of one policy.
+
+    ``agrees`` says whether a graph, run by the numpy kernels, is right; ``rounding`` what it explains, in a runtime, of
+    a tensor of a graph for inputs.
     """
 
     def __init__(

@@ -126,6 +126,7 @@ def compare_all(
     most: np.ndarray | None = None,
 ) -> list[Difference | None]:
     """``compare`` of pairs that differ in their rows only, in one go: to call numpy costs more than small arrays do.
+
     None for a pair that does not pass, or of which more has to be said: that is for ``compare``.
     """
     nothing: list[Difference | None] = [None] * len(references)

@@ -132,8 +132,9 @@ class Finding(Struct, frozen=True):
         return f"✗ {self.reason.split(' instead of')[0]}" if len(self.reason) < 40 else "✗"
 
     def columns(self) -> tuple[str, str, str, str]:
-        """The share, the difference, the relative one and what is allowed, for a table; empty where there is no such
-        number.
+        """The share, the difference, the relative one and what is allowed, for a table.
+
+        Each is empty where there is no such number.
         """
         return "", "", "", ""
 
@@ -223,8 +224,10 @@ class Draws(Shape, frozen=True):
 
 
 class Decisions(Finding, frozen=True):
-    """How many choices of a policy whose weights were rounded are other ones, or how far an action moves beside how
-    far it varies; ``reason`` says it whether it passed or not, ``runtime`` is what weights were rounded to.
+    """How many choices of a policy whose weights were rounded are other ones, or how far an action moves.
+
+    The distance stands beside how far the action varies; ``reason`` says it whether it passed or not, ``runtime`` is
+    what weights were rounded to.
     """
 
     kind = "decisions"

@@ -85,8 +85,10 @@ class Reference(AbstractContextManager["Reference"]):
         return answers
 
     def apart(self) -> frozenset[str]:
-        """Of what was asked, the draws whose odds no tensor of the source tells, and what else of them the kernels
-        answered for in its stead. Nothing where the source takes no part: what all is held against says it then.
+        """The requested draws whose odds no tensor of the source tells, and what else of them the kernels answered for.
+
+        The kernels answered in the source's stead. Empty where the source takes no part: what all is held against says
+        it then.
         """
         if self.original is None:
             return frozenset()

@@ -121,8 +121,9 @@ class Trial:
     def difference(
         self, name: str, expected: Feeds, got: np.ndarray, participant: Participant, at: Case | int | None = None
     ) -> Difference:
-        """``got`` beside the reference's answer. What rounding explains is looked at where it matters, for an input or
-        a step of the rollout.
+        """The difference of ``got`` from the reference's answer.
+
+        What rounding explains is looked at where it matters, for an input or a step of the rollout.
         """
         found = self._compare(name, expected, got, participant)
         if at is None or found.passed or found.reason:
@@ -277,8 +278,10 @@ class Trial:
         return answers
 
     def _is_right(self, graph: Graph) -> bool:
-        """Whether ``graph``, run by the numpy kernels, gives what the reference does; where inputs are far, rounding
-        alone may make a difference, which the model that rounds may be too wrong to explain.
+        """Whether ``graph``, run by the numpy kernels, gives what the reference does.
+
+        Where inputs are far, rounding alone may make a difference, which the model that rounds may be too wrong to
+        explain.
         """
         numpy = self.reference.participant("reference", [])
         for case, expected in zip(self.cases, self.expected, strict=True):
@@ -302,8 +305,10 @@ class Trial:
         }
 
     def _open_choices(self, name: str, expected: Feeds, participant: Participant, rounding: Feeds) -> np.ndarray | None:
-        """Where an argmax is not decided, because the scores of the reference are too close; and where no noise times a
-        deviation that overflows is NaN in a source that is fed zeros: the policy gives its mean there.
+        """Where an argmax is not decided, because the scores of the reference are too close.
+
+        So, too, where no noise times a deviation that overflows is NaN in a source that is fed zeros: the policy gives
+        its mean there.
         """
         spec = self.signature.output(name)
         if spec.role is not Role.DETERMINISTIC:

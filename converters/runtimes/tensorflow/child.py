@@ -37,8 +37,9 @@ def main() -> None:
     tf.config.threading.set_inter_op_parallelism_threads(1)
 
     class InSession:
-        """A graph in a Session; feeds and fetches are tensor names, inner ones too. The doubles of a ``source`` are
-        given as float32, as which they are exported.
+        """A graph in a Session; feeds and fetches are tensor names, inner ones too.
+
+        The doubles of a ``source`` are given as float32, as which they are exported.
         """
 
         def __init__(self, graph: Any, *, source: bool = False) -> None:

@@ -112,9 +112,9 @@ def _generation(state: State) -> _Generation:
 
 
 def to_graph(state: State, told: Sequence[tuple[int, ...]], goals: Sequence[int] = ()) -> tuple[Graph, SourceFacts]:
-    """The policy and what is known of it. ``told`` are the shapes of the sensors, where the user gives them, ``goals``
-    the places of those that are goals.
+    """The policy and what is known of it.
 
+    ``told`` are the shapes of the sensors, where the user gives them, ``goals`` the places of those that are goals.
     Raises SourceError and its kinds, UsageError.
     """
     generation = _generation(state)
@@ -285,8 +285,10 @@ def _resnet(net: Network, image: str, module: str) -> str:
 
 
 def _actions(net: Network, generation: _Generation, x: str) -> tuple[list[str], bool | None]:
-    """The outputs that act, by the names of the generation; and whether the continuous ones' deviation depends on the
-    observation (None: there are none). Then they are SAC's, and tanh bounds them.
+    """The outputs that act, by the names of the generation; and whether the deviation depends on the observation.
+
+    The deviation is that of the continuous ones (None: there are none). Where it depends, they are SAC's, and tanh
+    bounds them.
     """
     names: list[str] = []
     squashed: bool | None = None

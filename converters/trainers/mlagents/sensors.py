@@ -25,8 +25,10 @@ _SAY = "say what the agent observes, sensor by sensor in the order of their name
 
 
 class Sensor(Struct, frozen=True):
-    """One input of the network: its shape (lists of entities [most, numbers], images C, H, W), its module (None:
-    the numbers go in as they are), and why it is one.
+    """One input of the network.
+
+    ``shape`` has lists of entities as [most, numbers], images as C, H, W; ``module`` is None where the numbers go in as
+    they are; ``says`` is why it is a sensor.
     """
 
     shape: tuple[int, ...]
@@ -86,8 +88,10 @@ class Module(Struct, frozen=True):
 
 
 class Layout(Struct, frozen=True):
-    """What the weights tell of all sensors: modules in their order (None: one without weights), the columns that each
-    takes of the first layer, and how many are left over; ``two_lists``: vectors stand before the images.
+    """What the weights tell of all sensors.
+
+    ``modules`` are in their order (None: one without weights), ``known`` are the columns that each takes of the first
+    layer, and ``rest`` is how many are left over; ``two_lists``: vectors stand before the images.
     """
 
     modules: Sequence[str | None]

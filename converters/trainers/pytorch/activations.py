@@ -66,10 +66,11 @@ _OF_POLICY = frozenset(("policy", "actor", "student", "model"))
 def activation_of(
     given: Fetched, wanted: str | None, usual: str, default: tuple[str, str] | None = None
 ) -> tuple[Activation, tuple[Path, ...], tuple[str, ...]]:
-    """(the activation, files that said it, notes). ``wanted`` is what the user names, ``usual`` what trainers have,
-    ``default`` what is taken where nobody says it, with the note on that.
+    """Return (the activation, files that said it, notes).
 
-    Raises SourceError where nobody says it, UsageError where the user contradicts the file, or names none.
+    ``wanted`` is what the user names, ``usual`` what trainers have, ``default`` what is taken where nobody says it,
+    with the note on that. Raises SourceError where nobody says it, UsageError where the user contradicts the file, or
+    names none.
     """
     for name in _FILES:
         file = given.path.parent / name

@@ -35,8 +35,10 @@ class ArraysByName:
 
 
 class Weights:
-    """The tensors of one module. ``holder`` is what errors call it, ``maker`` who builds such networks, ``fix`` what to
-    do where one is not understood.
+    """The tensors of one module.
+
+    ``holder`` is what errors call it, ``maker`` who builds such networks, ``fix`` what to do where one is not
+    understood.
     """
 
     def __init__(self, archive: TensorFile, tensors: Mapping[Any, Any], *, holder: str, maker: str, fix: str) -> None:

@@ -37,8 +37,10 @@ _ACTIVATIONS = {
 
 
 class _Actor(Struct, frozen=True):
-    """Of a module of SBX: its twin in Stable-Baselines3, where the parameters are, the class that computes with them,
-    what the hidden layers are called there, and the last ones; ``hidden``: with an activation behind the last.
+    """A module of SBX, by its twin in Stable-Baselines3.
+
+    ``state`` is where the parameters are, ``classes`` are what computes with them, ``hidden`` is what the hidden layers
+    are called in the twin (with an activation behind the last, too), and ``heads`` the last layers.
     """
 
     twin: str

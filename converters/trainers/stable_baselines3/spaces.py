@@ -25,8 +25,10 @@ _SAVE_AGAIN = "save the model again: model.save"
 
 
 class Space(Struct, frozen=True):
-    """One space. ``counts``: how many values (Discrete has one number, MultiDiscrete some); ``low`` and ``high``: the
-    text of a Box's bounds.
+    """One space.
+
+    ``counts``: how many values (Discrete has one number, MultiDiscrete some); ``low`` and ``high``: the text of a Box's
+    bounds.
     """
 
     kind: str

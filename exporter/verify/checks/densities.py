@@ -32,8 +32,9 @@ _NEARLY_ALL = 0.95
 
 
 def densities(trial: Trial, participant: Participant) -> Iterator[Finding]:
-    """Both are drawn many times for one input, the reference by the numpy kernels, and each number of an output is
-    tested by itself (Kolmogorov-Smirnov for two samples of one size).
+    """Compare draws of numbers: each number of an output by itself (Kolmogorov-Smirnov for two samples of one size).
+
+    Both are drawn many times for one input, the reference by the numpy kernels.
     """
     names = _drawn_numbers(trial, participant)
     vectors = all(len(s.shape) <= 2 for s in trial.signature.observations)

@@ -1,5 +1,6 @@
-"""Classes that are drawn: many times for one input, against the reference's log-probabilities; and after two starts,
-which draw differently: with a seed of its own a sampler plays the same game every time.
+"""Classes that are drawn: many times for one input, against the reference's log-probabilities; and after two starts.
+
+Two starts draw differently: with a seed of its own a sampler plays the same game every time.
 """
 
 from __future__ import annotations
@@ -323,8 +324,10 @@ def repeats(drawn: np.ndarray, log_probs: np.ndarray, branches: Sequence[int]) -
 
 
 def _deviations(drawn: np.ndarray, probs: np.ndarray) -> np.ndarray:
-    """Classes [draws] less what is expected, [draws, components]: a column for each that was drawn, one for all others,
-    which differ from no draw to another. There may be many thousands of these.
+    """Classes [draws] less what is expected, [draws, components].
+
+    There is a column for each class that was drawn, and one for all others, which differ from no draw to another. There
+    may be many thousands of these.
     """
     classes = np.unique(drawn)
     rest = max(0.0, float(np.square(probs).sum() - np.square(probs[classes]).sum()))

@@ -91,8 +91,9 @@ def plausible(
 
 
 def check_recording(trial: Trial) -> Iterator[Finding]:
-    """The reference beside what a user recorded (exporter/verify/golden.py); what hangs on noise that was not is left
-    out.
+    """The reference beside what a user recorded (exporter/verify/golden.py).
+
+    What hangs on noise that was not recorded is left out.
     """
     golden, reference = trial.golden, trial.reference
     names = [s.name for s in trial.signature.outputs if s.name not in reference.drawn]
