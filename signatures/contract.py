@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import PurePosixPath
 from typing import Annotated, Any, Literal, NotRequired, TypedDict
@@ -146,11 +147,25 @@ def safe_name(name: str) -> str:
 
 
 def json_of(text: str | bytes) -> Any:
-    """What JSON text says. Raises FieldError."""
+    """What JSON text says.
+
+    Raises FieldError, too where an object has a key twice: readers differ in which of the two they take.
+    """
     try:
-        return loads(text, parse_constant=_no_number, parse_float=_finite)
+        return loads(text, parse_constant=_no_number, parse_float=_finite, object_pairs_hook=_object)
+    except FieldError:
+        raise
     except (ValueError, RecursionError) as error:
         raise FieldError(WHOLE, f"is not JSON ({error})"[:200]) from error
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    made = dict(pairs)
+    if len(made) < len(pairs):
+        counts = Counter(key for key, _ in pairs)
+        ((twice, _),) = counts.most_common(1)
+        raise FieldError(WHOLE, f"has {twice[:80]!r} twice in one object")
+    return made
 
 
 def _no_number(word: str) -> float:

@@ -24,7 +24,7 @@ from exporter import __version__
 from exporter.serve.scenes import AUTO, Scene, other_side, scene_of
 from exporter.serve.selftest import golden
 from exporter.serve.server import DATA, INDEX, TYPES
-from signatures.contract import PARITY, POLICY
+from signatures.contract import PARITY, POLICY, json_of
 from signatures.errors import BundleError, RuntimeUnavailableError, naming
 
 PAGE = Path(__file__).resolve().parent / "page"
@@ -185,8 +185,8 @@ def _original(policy: Bundle) -> str | None:
 
     try:
         with (policy.folder / PARITY).open("rb") as file:
-            report = json.loads(file.read(_MOST_REPORT_BYTES))
-    except (OSError, ValueError, RecursionError):
+            report = json_of(file.read(_MOST_REPORT_BYTES))
+    except (OSError, ValueError):
         return None
     original = report.get("original") if isinstance(report, dict) and report.get("passed") is True else None
     return runtime_title(original) if original in INDEPENDENT else None

@@ -259,6 +259,23 @@ def test_a_contract_that_is_no_object_is_refused(text: str, ball: Path) -> None:
     is_no_bundle(ball, ball / "policy.json", "must be an object")
 
 
+@pytest.mark.parametrize(
+    ("text", "again"),
+    [
+        ('"inputs": [', '"inputs": [], "inputs": ['),
+        ('"sha256": ', '"sha256": "", "sha256": '),
+        ('"name": "continuous"', '"name": "continuous", "n\\u0061me": "continuous"'),
+    ],
+)
+def test_a_contract_that_says_something_twice_is_refused(text: str, again: str, ball: Path) -> None:
+    """Whatever it says: a reader in another language may take the other one."""
+    path = ball / "policy.json"
+    said = path.read_text()
+    assert text in said
+    path.write_text(said.replace(text, again, 1))
+    is_no_bundle(ball, path, f"has {text.split(':')[0].replace(chr(34), chr(39))} twice in one object")
+
+
 SPOILT: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "no name": (lambda c: c.pop("name"), "name must be the name of a policy"),
     "a name that leads out": (lambda c: c.update(name="../continuous"), "name must be the name"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,7 +12,7 @@ from converters.formats.format import Port, Ports
 from converters.formats.programs.members import answers
 from converters.formats.programs.weights import weights_name
 from signatures.code import CodeOptions
-from signatures.contract import EMBEDDED, Contract, parse
+from signatures.contract import EMBEDDED, Contract, json_of, parse
 from signatures.errors import DamagedFileError, UnsupportedOpError
 
 #: What a file's ending says of its format.
@@ -34,7 +33,7 @@ def contract_held(path: Path) -> Contract:
         raise DamagedFileError(
             f"{path.name} has no contract", why="export-model did not write it", fix="export it again"
         )
-    return parse(json.loads(text))
+    return parse(json_of(text))
 
 
 def ports(path: Path) -> Ports:
