@@ -38,8 +38,8 @@ class _ReadKeywords(TypedDict, total=False):
 class _Keywords(_ReadKeywords, total=False):
     """With those of WriteOptions that no field of ReadOptions is called like."""
 
-    names: str
-    noise: str
+    names: str | None
+    noise: str | None
     deterministic: bool
     opset: int | None
     dtype: str

@@ -60,10 +60,10 @@ class ReadOptions(Struct, frozen=True, kw_only=True):
 class WriteOptions(Struct, frozen=True, kw_only=True):
     """How to write a policy."""
 
-    #: ``canonical`` tensor names, or the trainer's own: ``source``.
-    names: str = "canonical"
-    #: Noise drawn in the graph becomes an input (``lift``), stays (``keep``) or is removed (``zero``).
-    noise: str = "lift"
+    #: ``canonical`` tensor names (default), or the trainer's own: ``source``. A consumer has names of its own.
+    names: str | None = None
+    #: Noise drawn in the graph becomes an input (``lift``, the default), stays (``keep``) or is removed (``zero``).
+    noise: str | None = None
     #: Make ``action`` the deterministic one.
     deterministic: bool = False
     #: ONNX opset (default: 15, or that of the consumer).
@@ -89,13 +89,13 @@ class WriteOptions(Struct, frozen=True, kw_only=True):
 def compile_options(read: ReadOptions, write: WriteOptions | None = None) -> CompileOptions:
     """Return what the compiler needs of both. Raises UsageError."""
     write = write or WriteOptions()
-    if write.names not in ("canonical", "source"):
+    if write.names not in (None, "canonical", "source"):
         raise UsageError(f"names={write.names!r}: must be canonical or source")
-    if write.noise not in _NOISE:
+    if write.noise is not None and write.noise not in _NOISE:
         raise UsageError(f"noise={write.noise!r}: must be lift, keep or zero")
     return CompileOptions(
         names=write.names,
-        noise=_NOISE[write.noise],
+        noise=None if write.noise is None else _NOISE[write.noise],
         deterministic=write.deterministic,
         brain=read.brain,
         inputs=_roles(read.inputs, "--input"),

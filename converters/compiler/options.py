@@ -18,8 +18,10 @@ NoiseMode = Literal["lift", "keep", "zero"]
 class CompileOptions(Struct, frozen=True):
     """The fields are the flags of the command line."""
 
-    names: str = "canonical"  # canonical | source
-    noise: NoiseMode = "lift"
+    #: canonical or source; None: canonical, or the consumer's
+    names: str | None = None
+    #: None: ``lift``, or what the consumer does with noise
+    noise: NoiseMode | None = None
     deterministic: bool = False
     brain: str | None = None
     inputs: Mapping[str, Role] = field(default_factory=dict)

@@ -7,6 +7,7 @@ from typing import NoReturn
 
 from msgspec import Struct
 
+from converters.compiler.options import NoiseMode
 from converters.formats.format import WriteOptions
 from converters.formats.registry import WRITTEN
 from converters.policy.policy import Policy
@@ -23,7 +24,8 @@ class Profile(Struct, frozen=True, eq=False, kw_only=True):
     must play it. ``opset`` is the ONNX opset.
     ``code`` is the snippet that says how to use its files. ``loaders`` are those of
     ``converters/consumers/robots/loaders.py`` whose rules the ONNX must meet. ``batch`` is the number of agents that
-    the files are for (None: any).
+    the files are for (None: any). ``noise`` is what ``--noise`` may say of files in its names: it feeds none, so that
+    the model draws it or has none.
     """
 
     name: str
@@ -38,6 +40,7 @@ class Profile(Struct, frozen=True, eq=False, kw_only=True):
     code: str = "agent"
     loaders: tuple[str, ...] = ()
     batch: int | None = None
+    noise: tuple[NoiseMode, ...] = ("keep", "zero")
 
     @property
     def own_names(self) -> frozenset[str]:

@@ -94,6 +94,7 @@ PROFILES: tuple[Profile, ...] = (
         code="onnxruntime",
         loaders=("Isaac Lab",),
         batch=1,
+        noise=("zero",),
     ),
     Profile(
         name=GODOT_RL,
@@ -104,6 +105,7 @@ PROFILES: tuple[Profile, ...] = (
         opset=17,
         code="godot",
         loaders=("Godot RL Agents",),
+        noise=("zero",),
     ),
 )
 

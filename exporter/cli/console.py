@@ -210,7 +210,11 @@ class Console(Struct, frozen=True):
             say_paragraph("; ".join(details), indent, indent)
 
     def next_step(
-        self, results: Sequence[ExportResult], names: str, profile: str | None = None, sources: Sequence[Path] = ()
+        self,
+        results: Sequence[ExportResult],
+        names: str | None,
+        profile: str | None = None,
+        sources: Sequence[Path] = (),
     ) -> None:
         """What to do next, in a line or two; ``sources`` are what was exported, as it was typed."""
         if not results or self._silent or self.quiet:
@@ -235,7 +239,7 @@ class Console(Struct, frozen=True):
             say(f"next: {command_text('snippets', last.folder, '--for', wanted.name)}    (what to set there)")
             return
         ours = results[-1].policy.signature.family.startswith("ML-Agents")
-        if ours and names == "canonical" and _can_be_dressed(results[-1].sizes):
+        if ours and names != "source" and _can_be_dressed(results[-1].sizes):
             say_paragraph("note: Unity looks up other names: export with --for unity6 (--for help: the others)")
         say(f"next: {_next(results, sources)}")
 

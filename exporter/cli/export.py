@@ -59,13 +59,13 @@ if TYPE_CHECKING:
 @click.option(
     "--names",
     type=click.Choice(["canonical", "source"]),
-    default="canonical",
+    show_default="canonical",
     help="Tensor names: canonical, or the trainer's own.",
 )
 @click.option(
     "--noise",
     type=click.Choice(["lift", "keep", "zero"]),
-    default="lift",
+    show_default="lift",
     help="Noise drawn in the graph: an input, kept, or removed.",
 )
 @click.option("--deterministic", is_flag=True, help="Make 'action' the deterministic one.")

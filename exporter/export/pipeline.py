@@ -373,17 +373,26 @@ def _formats(options: ExportOptions, wanted: Profile | None) -> list[Format]:
             why="a bundle has one set of names, and these formats have different ones",
             fix="export twice, with another -o",
         )
-    for flag, given, left_out, decided in (
-        ("--names", options.compile.names, "canonical", "names"),
-        ("--opset", options.opset, None, f"opset: {wanted.opset}"),
+    for flag, given, decided in (
+        ("--names", options.compile.names, "names"),
+        ("--opset", options.opset, f"opset: {wanted.opset}"),
     ):
-        if given != left_out:
+        if given is not None:
             raise UsageError(
                 f"{flag} {given} does not go with --for {wanted.name}",
                 why=f"the consumer decides the {decided}",
                 fix=f"leave {flag} out",
             )
-    return [format_for_writing(target) for target in targets]
+    formats, noise = [format_for_writing(target) for target in targets], options.compile.noise
+    if noise is not None and noise not in wanted.noise and not wanted.own_names.issuperset(targets):
+        raise UsageError(
+            f"--noise {noise} does not go with --for {wanted.name}",
+            why="nothing feeds noise there: the model draws it"
+            if "keep" in wanted.noise
+            else "the consumer acts without chance: its files have the action at no noise",
+            fix=f"leave --noise out, or give --noise {' or '.join(wanted.noise)}",
+        )
+    return formats
 
 
 #: What a second policy of a report is.

@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import onnx
 import pytest
 
-from converters.compiler.options import CompileOptions
+from converters.compiler.options import CompileOptions, NoiseMode
 from converters.consumers.profile import Profile
 from converters.consumers.profiles import PROFILES, profile
 from converters.formats.barracuda.format import parse
@@ -332,6 +333,37 @@ def test_what_does_not_go_together_is_refused(how: dict[str, str], said: str, tm
     with pytest.raises(UsageError, match=said):
         export_model(ROOT / "fixtures" / "continuous.bytes", tmp_path, verify="none", **how)  # type: ignore[arg-type]
     assert not list(tmp_path.iterdir())
+
+
+#: A mean and a draw beside it, made inside the graph.
+DRAWN = [
+    placeholder("vector_observation"),
+    *dense("mu", "vector_observation", 3, 2),
+    node("rows", "Shape", "mu", out_type=np.int32),
+    node("draw", "RandomStandardNormal", "rows", dtype=np.float32),
+    node("action", "Add", "mu", "draw"),
+]
+
+
+@pytest.mark.parametrize("mode", get_args(NoiseMode))
+@pytest.mark.parametrize("named", [(p.name, form) for p in PROFILES for form in p.formats], ids="-".join)
+def test_what_is_said_of_noise_is_done_or_refused(named: tuple[str, str], mode: str, tmp_path: Path) -> None:
+    consumer, form = named
+    source = tmp_path / "drawn.bytes"
+    source.write_bytes(graph_bytes(DRAWN))
+    try:
+        (made,) = export_model(source, tmp_path, for_=consumer, to=form, noise=mode, verify="none")
+    except UsageError as error:
+        assert mode != "zero" and f"--noise {mode} does not go with --for {consumer}" in str(error)
+        (made,) = export_model(source, tmp_path, for_=consumer, to=form, verify="none")
+        assert mode not in _noise_of(made.policy)
+    else:
+        assert _noise_of(made.policy) == [mode]
+
+
+def _noise_of(policy: Policy) -> list[str]:
+    fed, drawn = bool(policy.signature.noise), any(n.op == "RandomStandardNormal" for n in policy.graph.nodes)
+    return [mode for mode, is_so in (("lift", fed), ("keep", drawn), ("zero", not (fed or drawn))) if is_so]
 
 
 def test_an_export_for_unity_is_verified_in_theruntimes(tmp_path: Path) -> None:

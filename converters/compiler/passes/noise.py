@@ -51,7 +51,7 @@ def settle_noise(c: Compilation) -> Compilation:
     for name in drawn:
         _check_rows(c.graph[name], types[name].shape or ())
     draws, fed = ({n: static_shape(types[n].shape) or () for n in names} for names in (drawn, taken))
-    graph = lift_noise(c.graph, "zero" if c.options.deterministic else c.options.noise, fed)
+    graph = lift_noise(c.graph, "zero" if c.options.deterministic else c.options.noise or "lift", fed)
     turned = {n.name: n.attrs["shape"].dims for n in graph.nodes if is_fed(n) and n.name not in c.graph}
     noise = {tensor_of(c.graph[name]): dims for name, dims in (draws | fed).items()}
     return replace(c, graph=graph, draws={**draws, **turned}, fed=fed, noise=noise)

@@ -212,7 +212,7 @@ def _output_roles(compiled: Compilation) -> dict[str, Role]:
 
 def _output_name(compiled: Compilation, name: str) -> str:
     """The output's name in the artefacts: canonical, or what the trainer called it."""
-    if compiled.options.names == "canonical":
+    if compiled.options.names != "source":
         return name
     # A number is no trainer's name but PyTorch's way of counting, and TensorFlow.js sorts such keys.
     brain = compiled.brain
