@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from exporter.cli.console import Console
+from exporter.cli.options import as_given
 from exporter.cli.terminal import say_paragraph
 from signatures.errors import UsageError
 
@@ -15,39 +16,31 @@ if TYPE_CHECKING:
     from exporter.verify.options import VerifyOptions
 
 
-def check_log_of(
-    bundles: Sequence[Path], log: Path, source: Path | None, options: VerifyOptions, console: Console
-) -> None:
+#: Parameters of ``verify`` that nothing of a log depends on.
+_UNHEARD = frozenset(
+    (
+        *("source", "step", "trust_source", "runtimes", "allow_unverified", "junit", "markdown", "tolerances"),
+        *("samples", "seed", "steps", "sizes", "required", "golden"),
+    )
+)
+
+
+def check_log_of(bundles: Sequence[Path], log: Path, options: VerifyOptions, console: Console) -> None:
     """Compute every step of ``log`` again and say what explains the steps that differ; ends with status 1 for those."""
     from exporter.acting.loading import load_policy
     from exporter.logs.check import check_log
     from exporter.logs.judging import LOG_TOLERANCE
-    from exporter.verify.options import VerifyOptions
     from exporter.verify.tolerances import Tolerance
 
     if len(bundles) != 1:
         raise UsageError(f"--log goes with one policy, and {len(bundles)} were given", fix="verify them one by one")
-    usual, default = VerifyOptions(), Tolerance()
-    unheard = {
-        "--source": source,
-        "--junit": console.junit,
-        "--markdown": console.markdown,
-        "--golden": options.golden,
-        "--max-size": options.budget,
-        "--require": options.require,
-        "--tolerances": options.rules,
-        "--samples": options.samples != usual.samples,
-        "--steps": options.steps != usual.steps,
-        "--seed": options.seed != usual.seed,
-    }
-    for flag, given in unheard.items():
-        if given:
-            raise UsageError(
-                f"{flag} does not go with --log",
-                why="a log's own steps are computed again, and nothing else",
-                fix="leave one of them out; --json and --html FILE write what was found",
-            )
-    wanted = options.tolerance
+    for flag in as_given(_UNHEARD)[:1]:
+        raise UsageError(
+            f"{flag} does not go with --log",
+            why="a log's own steps are computed again, and nothing else",
+            fix="leave one of them out; --json and --html FILE write what was found",
+        )
+    wanted, default = options.tolerance, Tolerance()
     tolerance = LOG_TOLERANCE if (wanted.atol, wanted.rtol) == (default.atol, default.rtol) else wanted
     with console.progress() as progress:
         progress("computing the steps again")

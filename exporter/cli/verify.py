@@ -75,7 +75,7 @@ def verify_command(
     if log is not None:
         from exporter.cli.logs import check_log_of
 
-        check_log_of(bundles, log, source, options, console)
+        check_log_of(bundles, log, options, console)
         return
     with ExitStack() as fetched:
         near = [(given, fetched.enter_context(nearby(given))) for given in bundles]

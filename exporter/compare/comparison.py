@@ -90,6 +90,8 @@ def compare_artefacts(
     """
     options = options or CompareOptions()
     judging = options.judging
+    if judging.runtimes == "none":
+        judging.check_unverified(("--max-size",))
     with ExitStack() as opened:
         given = [candidates] if isinstance(candidates, Path | str) else candidates
         reference = opened.enter_context(nearby(Path(reference)))

@@ -96,6 +96,11 @@ def verify_folder(
     """
     if step is not None and source is None:
         raise UsageError(f"--step {step} goes with --source", fix="give the folder of the run: --source FOLDER")
+    if (
+        runtimes == "none" and options is not None
+    ):  # sizes are compared all the same, and the kernels replay a recording
+        replayed = ("--golden", "--atol", "--rtol", "--tolerances") if options.golden is not None else ()
+        options.check_unverified(("--max-size", *replayed))
     found = Bundle.open(folder)
     found.verify_hashes()
     given = _Given() if source is None else _evidence_of(found, _source_of(source, found.contract, step, trust_source))

@@ -41,7 +41,6 @@ from exporter.remote.filesystem import remote
 from exporter.remote.sending import check_free, check_sendable, landing
 from exporter.tables import count_text
 from exporter.verify.checks.size import check_budget
-from exporter.verify.options import VerifyOptions
 from exporter.verify.tolerances import check_rules
 from signatures.contract import PARITY, Contract, safe_name
 from signatures.errors import (
@@ -334,19 +333,8 @@ def consumer(name: str) -> Profile:
 def _check_parity(options: ExportOptions, formats: Sequence[Format]) -> None:
     """What decides whether a policy passed is there, and is asked. Raises UsageError."""
     parity = options.parity
-    usual = VerifyOptions()
-    deciding = {
-        "--golden": parity.golden,
-        "--max-size": parity.budget,
-        "--tolerances": parity.rules,
-        "--samples": parity.samples != usual.samples,
-        "--steps": parity.steps != usual.steps,
-        "--atol": parity.tolerance.atol != usual.tolerance.atol,
-        "--rtol": parity.tolerance.rtol != usual.tolerance.rtol,
-    }
-    given = [flag for flag, value in deciding.items() if value]
-    if options.verify == "none" and given:
-        raise UsageError(f"{given[0]} needs a verification", why="--verify none was given", fix="leave one of them out")
+    if options.verify == "none":
+        parity.check_unverified()
     check_budget(parity.budget, {f.key: 0 for f in formats})
     if parity.golden is not None:
         from exporter.verify.golden import read_recording

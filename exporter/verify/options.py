@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 from msgspec import Struct, field
@@ -37,3 +37,28 @@ class VerifyOptions(Struct, frozen=True):
         for name, bound in (("atol", self.tolerance.atol), ("rtol", self.tolerance.rtol)):
             if not math.isfinite(bound) or bound < 0:
                 raise UsageError(f"--{name} {bound:g}: must be 0 or more, and finite", fix="leave it out: 1e-05")
+
+    @property
+    def flags(self) -> list[str]:
+        """The flags of what is to decide otherwise than by default."""
+        usual = VerifyOptions()
+        changed = {
+            "--golden": self.golden is not None,
+            "--max-size": bool(self.budget),
+            "--tolerances": bool(self.rules),
+            "--require": bool(self.require),
+            "--samples": self.samples != usual.samples,
+            "--steps": self.steps != usual.steps,
+            "--seed": self.seed != usual.seed,
+            "--atol": self.tolerance.atol != usual.tolerance.atol,
+            "--rtol": self.tolerance.rtol != usual.tolerance.rtol,
+        }
+        return [flag for flag, value in changed.items() if value]
+
+    def check_unverified(self, acting: Collection[str] = ()) -> None:
+        """Raise UsageError for what ``--verify none`` leaves without effect; the flags of ``acting`` have one."""
+        for flag in self.flags:
+            if flag not in acting:
+                raise UsageError(
+                    f"{flag} needs a verification", why="--verify none was given", fix="leave one of them out"
+                )

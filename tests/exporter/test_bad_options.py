@@ -70,6 +70,7 @@ def out(tmp_path: Path) -> Iterator[Path]:
         (["--jobs", "0"], ["--jobs 0: must be 1 or more"]),
         (["--samples", "9"], ["--samples needs a verification"]),
         (["--steps", "9"], ["--steps needs a verification"]),
+        (["--seed", "9"], ["--seed needs a verification"]),
         (["--atol", "1"], ["--atol needs a verification"]),
         (["--rtol", "1"], ["--rtol needs a verification"]),
         (["--require", "onnx"], ["--require onnx needs a verification", "--verify none was given"]),
@@ -91,6 +92,34 @@ def out(tmp_path: Path) -> Iterator[Path]:
 )
 def test_a_flag_that_cannot_be_is_refused(flags: list[str], words: list[str], out: Path) -> None:
     is_refused(export_model(BALL, "-o", out, "--verify", "none", *flags), *words)
+
+
+SAMPLING = (("--samples", "5"), ("--steps", "9"), ("--seed", "9"), ("--rtol", "1"))
+
+
+def test_what_only_a_comparison_heeds_is_refused_without_one(tmp_path: Path) -> None:
+    (made,) = export_by_python(BALL, tmp_path, verify="none", to="bytes,onnx")
+    bundle, none = made.folder, ("--verify", "none")
+    theirs = (bundle / "continuous.bytes", bundle / "continuous.onnx")
+    for flag in (*SAMPLING, ("--require", "onnx")):
+        is_refused(export_model("verify", bundle, *none, *flag), f"{flag[0]}", "needs a verification")
+        is_refused(export_model("compare", *theirs, *none, *flag), f"{flag[0]}", "needs a verification")
+    recorded = tmp_path / "recorded.npz"
+    np.savez(recorded, state=np.zeros((2, 8), np.float32), action=np.ones((2, 2), np.float32))
+    is_refused(export_model("compare", *theirs, *none, "--golden", recorded), "--golden needs a verification")
+
+
+def test_what_acts_without_a_comparison_is_taken_without_one(tmp_path: Path) -> None:
+    (made,) = export_by_python(BALL, tmp_path, verify="none", to="bytes,onnx")
+    recorded = tmp_path / "recorded.npz"
+    state, epsilon = np.zeros((2, 8), np.float32), np.zeros((2, 2), np.float32)
+    np.savez(recorded, state=state, epsilon=epsilon, action=np.full((2, 2), 7, np.float32))
+    verify = ("verify", made.folder, "--verify", "none")
+    assert export_model(*verify).status == 0
+    assert export_model(*verify, "--max-size", "1kB").status == 1
+    assert export_model(*verify, "--golden", recorded).status == 1
+    assert export_model(*verify, "--golden", recorded, "--atol", "100").status == 0
+    is_refused(export_model(*verify, "--golden", recorded, "--seed", "3"), "--seed needs a verification")
 
 
 @pytest.mark.filterwarnings("ignore:invalid value encountered in cast")

@@ -162,6 +162,8 @@ def test_verify_explains_a_log(tmp_path: Path) -> None:
         ("--golden", wrong),
         ("--junit", "a.xml"),
         ("--seed", "3"),
+        ("--verify", "none"),
+        ("--allow-unverified",),
     ):
         ran = export_model("verify", source, "--log", wrong, *unheard)
         is_refused(ran, f"{unheard[0]} does not go with --log")
