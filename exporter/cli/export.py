@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,6 +28,7 @@ from exporter.cli.terminal import say_lines
 
 if TYPE_CHECKING:
     from converters.compiler.options import CompileOptions
+    from converters.policy.policy import Policy
     from exporter.export.options import ExportOptions
     from exporter.export.pipeline import ExportResult
     from exporter.play.report import PlayReport
@@ -172,7 +173,14 @@ def _are_many(sources: Sequence[Path], out: Path) -> bool:
 
 def _export_few(sources: Sequence[Path], job: ExportOptions, env: str | None, console: Console) -> None:
     """Export sources in this process, and leave with the status of what came of it."""
-    results, refused = _export_all(sources, job, console)
+
+    def check_fit(policy: Policy) -> None:
+        if env is not None:
+            from exporter.play.named import world_maker
+
+            world_maker(env, sources[0])(policy.signature)
+
+    results, refused = _export_all(sources, job, console, check_fit)
     played: list[PlayReport] = [] if env is None else _play(env, sources[0], results, job, console)
     results = [_with_played(result, played) for result in results]
     told: dict[str, object] = {"refused": [e.to_dict() for e in refused]} if refused else {}
@@ -193,7 +201,7 @@ def _status(results: Sequence[ExportResult], played: Sequence[PlayReport]) -> in
 
 
 def _export_all(
-    sources: Sequence[Path], job: ExportOptions, console: Console
+    sources: Sequence[Path], job: ExportOptions, console: Console, understood: Callable[[Policy], object]
 ) -> tuple[list[ExportResult], list[ExportModelError]]:
     """Export sources one after the other, and print what came of each; return the results and what was refused."""
     from exporter.export.pipeline import export
@@ -207,7 +215,7 @@ def _export_all(
             progress.clear()
             say_lines(f"error: {error.message}", err=True)
 
-        for result in export(list(sources), job, progress, refused=refuse):
+        for result in export(list(sources), job, progress, refused=refuse, understood=understood):
             results.append(result)
             progress.clear()
             console.print_result(result)

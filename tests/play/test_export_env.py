@@ -39,6 +39,7 @@ def test_rounded_weights_are_held_by_returns_against_the_source_as_it_was(tmp_pa
         (("--env", "GridWorld", "--verify", "none"), "--env needs runtimes"),
         (("--env", "GridWorld", "--for", "unity6"), "--env does not go with --for"),
         (("--env", "GridWorld", "--jobs", "2"), "--env goes with a single source"),
+        (("--env", "3DBall", *WHERE), "--env 3DBall: the policy does not fit the environment"),
     ],
 )
 def test_what_cannot_play_is_refused_before_anything_is_written(
