@@ -308,7 +308,15 @@ class Builder:
         return reference if same else self.add("Cast", [reference], name, DstT=np.dtype(dtype))
 
     def slice(
-        self, reference: str, axis: int, start: int | None, stop: int | None, step: int = 1, *, dropped: bool = False
+        self,
+        reference: str,
+        axis: int,
+        start: int | None,
+        stop: int | None,
+        step: int = 1,
+        *,
+        dropped: bool = False,
+        name: str = "",
     ) -> str:
         """``x[..., start:stop:step]`` at one axis, which stays unless it is ``dropped``."""
         begin, end, steps = [0] * (axis + 1), [0] * (axis + 1), [1] * (axis + 1)
@@ -317,6 +325,7 @@ class Builder:
         return self.add(
             "StridedSlice",
             [reference, self.ints(begin, "begin"), self.ints(end, "end"), self.ints(steps, "steps")],
+            name,
             begin_mask=masks | (1 << axis if start is None else 0),
             end_mask=masks | (1 << axis if stop is None else 0),
             shrink_axis_mask=1 << axis if dropped else 0,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 
@@ -159,56 +160,51 @@ def _rewrite(graph: Graph, memories: Sequence[SeparateMemory], origins: Mapping[
     taken = editor.add_name(CANONICAL[Role.MEMORY_IN])
     attrs = {"dtype": FLOAT32, "shape": TensorShape((None, sum(_size(m.taken) for m in memories)))}
     editor.keep(Node(taken, "Placeholder", attrs=attrs, origin=joined_name([origins[m.input] for m in memories])))
-    begin = 0
-    for memory in memories:
-        end = begin + _size(memory.taken)
-        editor.redirect(memory.input, _split(editor, taken, memory, (begin, end), origins[memory.input], len(memories)))
-        begin = end
+    bounds = itertools.pairwise(itertools.accumulate((_size(m.taken) for m in memories), initial=0))
+    for memory, ends in zip(memories, bounds, strict=True):
+        editor.redirect(memory.input, _split(editor, taken, memory, ends, origins[memory.input], len(memories)))
     gone = {m.input for m in memories}
     for node in graph.nodes:
         if node.name not in gone:
             editor.keep(node)
     columns = [_columns(editor, memory) for memory in memories]
     name, origin = CANONICAL[Role.MEMORY_OUT], joined_name([origins[m.output] for m in memories])
-    if len(columns) == 1:
-        given = editor.add("Identity", columns, name, origin)
+    editor.prefix = ""
+    if len(columns) > 1:
+        given = editor.add("ConcatV2", [*columns, editor.ints(1, f"{name}/axis")], name, origin)
     else:
-        axis = editor.ints(1, f"{name}/axis")
-        given = editor.add("ConcatV2", [*columns, axis], name, origin)
+        given = editor.add("Identity", columns, name, origin)
     return editor.graph(), taken, given
 
 
 def _split(editor: Editor, taken: str, memory: SeparateMemory, bounds: tuple[int, int], origin: str, count: int) -> str:
     """A memory's columns of ``recurrent_in``, in the shape that the source takes it in."""
-    part, name, shape = taken, memory.input, memory.taken
-    if count > 1:
-        numbers = {"begin": [0, bounds[0]], "end": [0, bounds[1]], "steps": [1, 1]}
-        operands = [editor.ints(v, f"{name}/{k}") for k, v in numbers.items()]
-        part = editor.add("StridedSlice", [taken, *operands], f"{name}/columns", begin_mask=1, end_mask=1)
+    editor.prefix, shape = memory.input, memory.taken
+    part = taken if count == 1 else editor.slice(taken, 1, *bounds, name="columns")
     axis = shape.index(None)
     rest = [d for d in shape if d is not None]
     before = math.prod(rest[:axis])
     if len(shape) > 2:
         dims = [-1 if d is None else d for d in shape] if before == 1 else [-1, *rest]
-        part = editor.add("Reshape", [part, editor.ints(dims, f"{name}/shape")], f"{name}/rows")
+        part = editor.add("Reshape", [part, editor.ints(dims, "shape")], "rows")
     if before != 1:
         order = [*range(1, axis + 1), 0, *range(axis + 1, len(shape))]
-        part = editor.add("Transpose", [part, editor.ints(order, f"{name}/order")], f"{name}/part")
-    return editor.add("Identity", [part], f"{name}/given", origin)
+        part = editor.add("Transpose", [part, editor.ints(order, "order")], "part")
+    return editor.add("Identity", [part], "given", origin)
 
 
 def _columns(editor: Editor, memory: SeparateMemory) -> str:
     """A memory as the source gives it, [B, n]."""
-    part, name, shape = memory.output, f"{split_ref(memory.output)[0]}/fed_back", memory.given
+    part, shape = memory.output, memory.given
+    editor.prefix = f"{split_ref(part)[0]}/fed_back"
     axis = shape.index(None)
     rest = [d for d in shape if d is not None]
     if math.prod(rest[:axis]) != 1:
         order = [axis, *(i for i in range(len(shape)) if i != axis)]
-        part = editor.add("Transpose", [part, editor.ints(order, f"{name}/order")], f"{name}/rows")
+        part = editor.add("Transpose", [part, editor.ints(order, "order")], "rows")
     if shape[1:] == (_size(shape),):
         return part
-    dims = editor.ints([-1, _size(shape)], f"{name}/shape")
-    return editor.add("Reshape", [part, dims], f"{name}/columns")
+    return editor.add("Reshape", [part, editor.ints([-1, _size(shape)], "shape")], "columns")
 
 
 def _has_rows_first(node: Node) -> bool:
