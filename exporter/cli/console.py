@@ -224,24 +224,14 @@ class Console(Struct, frozen=True):
             say(f"next: read {failed.folder}/parity.json; the bundle was kept apart because its formats disagree")
             return
         if profile is not None:
-            last = results[-1]
-            files = ", ".join(sorted(p.name for p in last.folder.iterdir() if p.suffix in (".onnx", ".nn", ".bytes")))
-            from converters.consumers.profiles import profile as known
-            from exporter.tables import command_text
-
-            wanted = known(profile)
-            for line in _to_verify(last, sources):
+            for line in _next_for(results, profile, sources):
                 say(f"next: {line}")
-            place = f"give {files} of {last.folder} to {' and '.join(wanted.loaders)}"
-            if not wanted.loaders:
-                place = f"put {files} of {last.folder} into a project of {wanted.purpose}"
-            say(f"next: {place}")
-            say(f"next: {command_text('snippets', last.folder, '--for', wanted.name)}    (what to set there)")
             return
         ours = results[-1].policy.signature.family.startswith("ML-Agents")
         if ours and names != "source" and _can_be_dressed(results[-1].sizes):
             say_paragraph("note: Unity looks up other names: export with --for unity6 (--for help: the others)")
-        say(f"next: {_next(results, sources)}")
+        for line in _next(results, sources):
+            say(f"next: {line}")
 
     def json(self, content: Mapping[str, Any]) -> None:
         """The answer for a program, where it was asked for."""
@@ -256,30 +246,55 @@ def _can_be_dressed(sizes: Mapping[str, int]) -> bool:
     return any(WRITTEN[key].unity for key in sizes)
 
 
-def _verify_again(result: ExportResult, sources: Sequence[Path]) -> str:
-    """The command that verifies a bundle: with its source, where it has no file that is a reference."""
+def _verify_again(results: Sequence[ExportResult], sources: Sequence[Path]) -> list[str]:
+    """The commands that verify bundles: with their source, where they have no file that is a reference."""
     from converters.formats.registry import own_reference
     from exporter.tables import command_text
 
-    if own_reference(result.sizes) is not None:
-        return command_text("verify", result.folder)
-    named = [s for s in sources if s.name == result.agreed.origin.path]
-    return command_text("verify", result.folder, "--source", *(named or [Path(result.agreed.origin.path)])[:1])
+    folders: dict[tuple[object, ...], list[Path]] = {}
+    for result in results:
+        source: tuple[object, ...] = ()
+        if own_reference(result.sizes) is None:
+            named = [s for s in sources if s.name == result.agreed.origin.path]
+            source = ("--source", *(named or [Path(result.agreed.origin.path)])[:1])
+        folders.setdefault(source, []).append(result.folder)
+    return [command_text("verify", *bundles, *source) for source, bundles in folders.items()]
 
 
-def _to_verify(result: ExportResult, sources: Sequence[Path]) -> list[str]:
+def _to_verify(results: Sequence[ExportResult], sources: Sequence[Path]) -> list[str]:
     """How to get a runtime, and what to verify then, where none ran."""
     from exporter.reports.summary import to_verify
     from exporter.tables import hint
 
-    if result.report is None or result.report.passed is not None:
+    open_ = [r for r in results if r.report is not None and r.report.passed is None]
+    install = next(filter(None, (to_verify(r.report) for r in open_ if r.report is not None)), None)
+    if install is None:
         return []
-    install = to_verify(result.report)
-    return [] if install is None else [hint(install, f"then: {_verify_again(result, sources)}")]
+    first, *others = _verify_again(open_, sources)
+    return [hint(install, f"then: {first}"), *others]
 
 
-def _next(results: Sequence[ExportResult], sources: Sequence[Path]) -> str:
-    """The one command that is worth most now: for the policy that the page has a scene for, else the last."""
+def _next_for(results: Sequence[ExportResult], profile: str, sources: Sequence[Path]) -> list[str]:
+    """What to do with the files for a consumer, and where each policy's settings are told."""
+    from converters.consumers.profiles import profile as known
+    from exporter.tables import command_text
+
+    wanted = known(profile)
+    *rest, last = (f"{_files(r)} of {r.folder}" for r in results)
+    files = f"{', '.join(rest)} and {last}" if rest else last
+    place = f"give {files} to {' and '.join(wanted.loaders)}"
+    if not wanted.loaders:
+        place = f"put {files} into a project of {wanted.purpose}"
+    settings = [f"{command_text('snippets', r.folder, '--for', wanted.name)}    (what to set there)" for r in results]
+    return [*_to_verify(results, sources), place, *settings]
+
+
+def _files(result: ExportResult) -> str:
+    return ", ".join(sorted(p.name for p in result.folder.iterdir() if p.suffix in (".onnx", ".nn", ".bytes")))
+
+
+def _next(results: Sequence[ExportResult], sources: Sequence[Path]) -> list[str]:
+    """The command that is worth most now: for the policy that the page has a scene for, else the last."""
     from exporter.tables import command_text, hint
 
     last = results[-1]
@@ -288,18 +303,18 @@ def _next(results: Sequence[ExportResult], sources: Sequence[Path]) -> str:
 
         last = next((r for r in results if scene_of(r.policy.name, r.policy.signature) is not None), last)
     if last.report is None:
-        return hint(_verify_again(last, sources), "nothing was compared yet")
-    for line in _to_verify(last, sources):
-        return line
+        return [hint(command, "nothing was compared yet") for command in _verify_again(results, sources)]
+    if told := _to_verify(results, sources):
+        return told
     from exporter.serve.site import NEEDED
 
     if NEEDED.keys() <= last.sizes.keys():
-        return hint(command_text("serve", last.folder), "see it act, in a browser")
+        return [hint(command_text("serve", last.folder), "see it act, in a browser")]
     from exporter.snippets.registry import languages
 
     if not (said := languages(last.sizes)):
-        return hint(_verify_again(last, sources), "in a job, whenever it may have changed")
-    return hint(command_text("snippets", last.folder), f"code for {said}")
+        return [hint(command, "in a job, whenever it may have changed") for command in _verify_again(results, sources)]
+    return [hint(command_text("snippets", last.folder), f"code for {said}")]
 
 
 def reporting(command: Callable[..., Any]) -> Callable[..., Any]:

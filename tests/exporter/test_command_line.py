@@ -6,6 +6,7 @@ import io
 import json
 import os
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -179,6 +180,29 @@ def test_a_success_says_where_the_policy_is_and_what_to_do_next(tmp_path: Path) 
     assert lines[-1].startswith(f"next: export-model verify '{out / 'continuous'}'")
     assert "NOT VERIFIED: --verify none" in lines
     assert [line.split()[0] for line in lines[3:7]] == list(DEFAULTS)
+
+
+@pytest.mark.parametrize("profile", ["unity6", "godot-rl"])
+def test_of_several_policies_for_a_consumer_each_has_its_next_step(profile: str, tmp_path: Path) -> None:
+    ran = export_model(fixture("twobrains"), fixture("continuous"), "-o", tmp_path, "--for", profile, *UNVERIFIED)
+    place, *commands = [line.removeprefix("next: ") for line in ran.out.splitlines() if line.startswith("next: ")]
+    written = sorted(path for path in tmp_path.glob("*/*.onnx"))
+    assert len(written) == 3 and all(f"{path.name} of {path.parent}" in place for path in written)
+    assert [shlex.split(c)[2] for c in commands] == sorted((str(p.parent) for p in written), key=ran.out.index)
+    for command in commands:
+        assert export_model(*shlex.split(command.split("    (")[0])[1:]).status == 0
+
+
+@pytest.mark.parametrize("targets", ["bytes", "onnx"])
+def test_of_several_policies_that_were_not_compared_each_is_in_a_command(targets: str, tmp_path: Path) -> None:
+    sources = (fixture("twobrains"), fixture("continuous"))
+    ran = export_model(*sources, "-o", tmp_path, "--to", targets, *UNVERIFIED)
+    commands = [line.removeprefix("next: ") for line in ran.out.splitlines() if line.startswith("next: ")]
+    calls = [shlex.split(command.split("    (")[0])[1:] for command in commands]
+    folders = {str(path.parent) for path in tmp_path.glob("*/policy.json")}
+    assert len(folders) == 3 and {word for call in calls for word in call} >= folders
+    for call in calls:
+        assert export_model(*call, "--runtimes", "onnxruntime,tensorflow").status == 0
 
 
 def test_an_export_that_unity_does_not_take_says_how_to_make_one(tmp_path: Path) -> None:
