@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from converters.formats.registry import WRITTEN
+from converters.formats.registry import KERNELS, WRITTEN
 from converters.runtimes.pool import INDEPENDENT
 from exporter.tables import count_text
 from exporter.verify.findings import Accepted, Decisions, Draws, Failure, Finding, Played, Size, Undecided
@@ -40,6 +40,12 @@ def checked_formats(report: ParityReport) -> list[str]:
     return [label for label in formats_of(report) if label in ran]
 
 
+def kernel_formats(report: ParityReport) -> list[str]:
+    """Return the formats of which this project's kernels alone gave numbers: they read the file back."""
+    ran = {_whole(c.format, report) for c in report.comparisons if c.runtime == KERNELS and _numbers(c)}
+    return [label for label in unchecked_formats(report) if label in ran]
+
+
 def unchecked_formats(report: ParityReport) -> list[str]:
     """Return the formats that no independent runtime ran."""
     checked = checked_formats(report)
@@ -61,10 +67,13 @@ def verdict(report: ParityReport) -> str:
         return f"NOT VERIFIED: {report.undecided}"
     if report.passed is None:
         if says:
-            rest = ", ".join(unchecked_formats(report))
+            own = kernel_formats(report)
+            rest = ", ".join(label for label in unchecked_formats(report) if label not in own)
             by = " and ".join(filter(None, (_checkers(says), _players(says))))
-            return f"ACCEPTED by {by}; no numbers of {rest} were compared in any runtime"
-        return "NOT VERIFIED: no independent runtime ran"
+            numbers = f"; no numbers of {rest} were compared in any runtime" if rest else ""
+            return f"ACCEPTED by {by}{_by_kernels(report)}{numbers}"
+        none = f" {_enumerate_names(unchecked_formats(report))}" if kernel_formats(report) else ""
+        return f"NOT VERIFIED: no independent runtime ran{none}{_by_kernels(report)}"
     if not report.passed:
         return f"FAILED: {'; '.join(_wrong(report))}{_drawn_apart(report)}"
     word = "SELF-CONSISTENT" if report.self_consistent else "PASSED"
@@ -88,6 +97,17 @@ def reference_text(report: ParityReport) -> str:
     if report.self_consistent:
         return "export-model's reading of the original, which nothing else here can run"
     return "export-model's reading of the original, which was not run"
+
+
+def _by_kernels(report: ParityReport) -> str:
+    """A clause on what this project's own kernels read back, where no other runtime runs it."""
+    own = kernel_formats(report)
+    if not own:
+        return ""
+    if report.reference in (f"{label}/{KERNELS}" for label in own):  # itself
+        return f"; {_enumerate_names(own)} answered in export-model's own kernels"
+    verb = "agrees" if len(own) == 1 else "agree"
+    return f"; read back by export-model's own kernels, {_enumerate_names(own)} {verb} with {reference_text(report)}"
 
 
 def _agreement(report: ParityReport) -> str:

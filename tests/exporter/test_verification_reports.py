@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from exporter.reports.summary import (
     comparison_table,
@@ -16,7 +17,7 @@ from exporter.reports.summary import (
     to_verify,
     whole_summary,
 )
-from exporter.verify.findings import Failure, Finding, Numbers
+from exporter.verify.findings import Accepted, Failure, Finding, Numbers
 from exporter.verify.report import ParityReport
 from exporter.verify.tolerances import Tolerance
 from exporter.verify.verdict import verdict
@@ -79,6 +80,19 @@ def test_a_report_without_an_independent_runtime_is_not_verified() -> None:
         "pip install x",
         "not run here: x    (export-model runtimes says how to install them)",
     )
+
+
+def test_what_the_own_kernels_alone_read_back_is_said() -> None:
+    nn = comparison(format="nn", runtime="numpy", passed=True)
+    report = ParityReport("p", None, 0, 2, "source/tensorflow", {}, (nn,), original="tensorflow")
+    agrees = "; read back by export-model's own kernels, nn agrees with the original in TensorFlow"
+    assert verdict(report) == f"NOT VERIFIED: no independent runtime ran nn{agrees}"
+    of_consumer = replace(report, comparisons=(comparison(Accepted, format="nn", runtime="R20", passed=True), nn))
+    assert verdict(of_consumer) == f"ACCEPTED by Unity's checks (release 20){agrees}"
+    beside = replace(of_consumer, comparisons=(*of_consumer.comparisons, comparison(Failure, format="onnx")))
+    assert verdict(beside).endswith("; no numbers of onnx were compared in any runtime")
+    itself = replace(report, original=None, reference="nn/numpy")
+    assert verdict(itself) == "NOT VERIFIED: no independent runtime ran nn; nn answered in export-model's own kernels"
 
 
 def test_many_policies_are_one_line() -> None:

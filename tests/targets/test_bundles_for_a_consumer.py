@@ -54,7 +54,7 @@ def test_verify_dresses_the_source_and_compares(wanted: str, runtime: str, tmp_p
     held = commands.export_model("verify", folder, *how)
     assert held.status == 0, held.out
     assert "the policy under its own names, from which this was made: " in held.out
-    assert "no numbers were compared" not in held.out
+    assert "no numbers of" not in held.out
 
 
 def test_without_the_source_it_is_said_that_no_numbers_were_compared(tmp_path: Path) -> None:
