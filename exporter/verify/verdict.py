@@ -176,7 +176,7 @@ def _loaders(names: Sequence[str]) -> str:
     """The loaders outside Unity among those that were asked."""
     from converters.consumers.robots.loaders import LOADERS
 
-    return " and ".join(f"the rules of {name}'s loader" for name in names if name in LOADERS)
+    return " and ".join(f"the loader rules of {name}" for name in names if name in LOADERS)
 
 
 def _players(says: Sequence[Finding]) -> str:

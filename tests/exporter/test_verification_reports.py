@@ -95,6 +95,12 @@ def test_what_the_own_kernels_alone_read_back_is_said() -> None:
     assert verdict(itself) == "NOT VERIFIED: no independent runtime ran nn; nn answered in export-model's own kernels"
 
 
+def test_a_loader_is_named_as_it_is_called() -> None:
+    accepted = comparison(Accepted, runtime="Godot RL Agents", passed=True)
+    report = ParityReport("p", None, 0, 2, "numpy", {}, (accepted,))
+    assert verdict(report).startswith("ACCEPTED by the loader rules of Godot RL Agents; ")
+
+
 def test_many_policies_are_one_line() -> None:
     good = ParityReport("p", True, 0, 2, "numpy", {}, (comparison(passed=True), comparison(share=0.1)))
     bad = ParityReport("q", False, 0, 2, "numpy", {}, (comparison(),))
