@@ -222,12 +222,23 @@ def fetches() -> bool:
 
 
 def neighbours(path: Path) -> str:
-    """What to do where nothing lies at a path: the name that is nearest to its own in that folder."""
+    """What to do where nothing lies at a path: the name of that kind that is nearest to its own in that folder."""
     try:
         names = sorted(p.name for p in path.parent.iterdir())
     except OSError:  # there is no such folder, or it may not be listed
         names = []
     import difflib
 
+    if path.suffix:  # x.toml is near h.html by its ending alone
+        alike = [n for n in names if _one_edit(path.suffix.lower(), Path(n).suffix.lower())]
+        stems = difflib.get_close_matches(path.stem, {Path(n).stem for n in alike}, n=len(names) or 1)
+        names = [n for n in alike if Path(n).stem in stems]
     close = difflib.get_close_matches(path.name, names, n=1)
     return f"did you mean {path.parent / close[0]}?" if close else "check the path"
+
+
+def _one_edit(word: str, other: str) -> bool:
+    """Return whether a letter that is left out, added or another makes one word the other."""
+    same = next((i for i, (a, b) in enumerate(zip(word, other, strict=False)) if a != b), min(len(word), len(other)))
+    rest, its = word[same:], other[same:]
+    return rest[1:] == its[1:] or rest == its[1:] or rest[1:] == its

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from converters.files import tensorflow_messages as schema
+from converters.files.fetch import neighbours
 from converters.formats.recognise import recognise
 from converters.graph.nodes import TensorShape
 from exporter import inspect_model
@@ -184,6 +185,26 @@ def test_a_missing_file_names_the_one_that_was_probably_meant(tmp_path: Path) ->
     is_refused(export_model(tmp_path / "3DBal.bytes"), "no such file", f"did you mean {tmp_path / '3DBall.bytes'}?")
     is_refused(export_model(tmp_path / "Walker.onnx"), "no such file", "check the path")
     is_refused(export_model(tmp_path / "nowhere" / "3DBall.bytes"), "no such file", "check the path")
+
+
+@pytest.mark.parametrize(
+    ("there", "missing", "is_meant"),
+    [
+        ("h.html", "x.toml", False),
+        ("b.toml", "a.toml", False),
+        ("labels.html", "labels.toml", False),
+        ("3DBall.html", "3DBall.onnx", False),
+        ("labels.toml", "label.toml", True),
+        ("3DBall.onnx", "3DBall.onx", True),
+        ("3DBall.onnx", "3DBall", True),
+    ],
+)
+def test_what_is_suggested_is_near_in_name_and_of_the_same_kind(
+    there: str, missing: str, is_meant: bool, tmp_path: Path
+) -> None:
+    (tmp_path / there).touch()
+    said = neighbours(tmp_path / missing)
+    assert said == (f"did you mean {tmp_path / there}?" if is_meant else "check the path")
 
 
 def test_an_address_is_no_path() -> None:
