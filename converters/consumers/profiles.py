@@ -8,7 +8,7 @@ from converters.consumers.mlagents import version2, version3
 from converters.consumers.mlagents.tensorflowsharp import Generation, dress
 from converters.consumers.profile import Profile
 from converters.consumers.robots.naming import GODOT_RL, ISAAC_LAB, name_for_godot_rl, name_for_isaac_lab
-from converters.consumers.unity.consumers import releases_for
+from converters.consumers.unity.consumers import editor_hint, purpose_text, releases_for
 from converters.formats.registry import BARRACUDA, FROZEN_GRAPH, ONNX
 from signatures.errors import UsageError, suggestion
 
@@ -42,7 +42,7 @@ PROFILES: tuple[Profile, ...] = (
     Profile(
         name="unity6",
         aliases=("sentis", "inference-engine"),
-        purpose="ML-Agents 3.0 and 4.0 in Unity 2023 and Unity 6 (Sentis 2.1, Inference Engine 2.2 to 2.4)",
+        purpose=purpose_text("ML-Agents 3.0 and 4.0", "unity6", "Sentis 2.1, Inference Engine 2.2 to 2.4"),
         formats=(ONNX.key,),
         # PreviousActionInputGenerator of 3.0.0 throws at the first decision (../shared/unity/r3/player.json)
         dress=partial(version3.dress, profile="unity6", feeds_previous=False),
@@ -53,7 +53,7 @@ PROFILES: tuple[Profile, ...] = (
     Profile(
         name="barracuda-3",
         aliases=("barracuda",),
-        purpose="ML-Agents 2.3 (release 20) in Unity 2020 to 2022 (Barracuda 3.0)",
+        purpose=purpose_text("ML-Agents 2.3 (release 20)", "barracuda-3", "Barracuda 3.0"),
         formats=(ONNX.key, BARRACUDA.key),
         # measured in releases 20 and 2.0.1: ../shared/unity/r3/minimal/rank2.jsonl
         dress=partial(version3.dress, profile="barracuda-3", transposes_buffers=True),
@@ -64,7 +64,7 @@ PROFILES: tuple[Profile, ...] = (
     ),
     Profile(
         name="barracuda-1.4",
-        purpose="ML-Agents 2.0 to 2.2 (releases 17 to 19) in Unity 2019 to 2021 (Barracuda 1.4 to 2.3)",
+        purpose=purpose_text("ML-Agents 2.0 to 2.2 (releases 17 to 19)", "barracuda-1.4", "Barracuda 1.4 to 2.3"),
         formats=(ONNX.key, BARRACUDA.key),
         dress=partial(version3.dress, profile="barracuda-1.4", transposes_buffers=True),
         opset=12,
@@ -74,8 +74,8 @@ PROFILES: tuple[Profile, ...] = (
     ),
     Profile(
         name="barracuda-1.0",
-        purpose="ML-Agents 1.0 to 1.9 (releases 1 to 16) in Unity 2018 to 2020 (Barracuda 1.0 to 1.3); "
-        "memory in .nn alone",
+        purpose=purpose_text("ML-Agents 1.0 to 1.9 (releases 1 to 16)", "barracuda-1.0", "Barracuda 1.0 to 1.3")
+        + "; memory in .nn alone",
         formats=(ONNX.key, BARRACUDA.key),
         dress=partial(version2.dress, profile="barracuda-1.0"),
         opset=11,
@@ -118,5 +118,6 @@ def profile(name: str) -> Profile:
     close = suggestion(name.lower(), (n for p in PROFILES for n in (p.name, *p.aliases)))
     raise UsageError(
         f"--for {name}: unknown profile",
+        why=editor_hint(name),
         fix=f"{close}the profiles are {', '.join(p.name for p in PROFILES)}",
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,12 @@ from converters.consumers.unity.checker import check_file
 from converters.consumers.unity.consumers import CONSUMERS, EARLIER
 from converters.consumers.unity.settings import Brain, sensors_of
 from exporter.cli.app import app
+from fixtures import path as fixture
 from signatures.errors import UsageError
 from tests.commands import export_model, is_refused
 from tests.unity.policies import Draft
 
+BALL = fixture("continuous")
 BOTH = {"stochastic": True, "deterministic": True}
 BOTH_NOT = {"stochastic": False, "deterministic": False}
 
@@ -93,6 +96,29 @@ def test_a_folder_is_checked_file_by_file(tmp_path: Path) -> None:
 def test_options_that_say_nothing_are_refused(tmp_path: Path, options: list[str]) -> None:
     result = run(Draft().write(tmp_path), *options)
     assert isinstance(result.exception, UsageError)
+
+
+@pytest.mark.parametrize(
+    ("editor", "releases", "profiles"),
+    [
+        ("2019.4", ["2.0.1", "1.9.1", "1.0.8"], ["barracuda-1.4", "barracuda-1.0"]),
+        ("2022.3.10f1", ["R20"], ["barracuda-3"]),
+        ("6", ["R22", "R23", "R23-2.4"], ["unity6"]),
+        ("Unity 6000.2", ["R22", "R23", "R23-2.4"], ["unity6"]),
+    ],
+)
+def test_an_editor_in_place_of_a_release_is_told_its_releases(
+    editor: str, releases: list[str], profiles: list[str], tmp_path: Path
+) -> None:
+    for command in (("inspect", BALL, "--unity", editor), (BALL, "-o", tmp_path, "--for", editor)):
+        ran = export_model(*command)
+        is_refused(ran, "a version of the editor")
+        assert re.findall(r"--unity ([\w.-]+),", ran.err) == releases
+        assert list(dict.fromkeys(re.findall(r"--for ([\w.-]+)\)", ran.err))) == profiles
+
+
+def test_what_is_neither_a_release_nor_an_editor_is_told_the_releases() -> None:
+    is_refused(export_model("inspect", BALL, "--unity", "R19"), *(c.title for c in (CONSUMERS | EARLIER).values()))
 
 
 # ------------------------------------------------------------------ what the player does

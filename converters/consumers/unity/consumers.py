@@ -8,6 +8,7 @@ Engine 2.4.1; the checker of 4.0.0 was run on 2.4.0 in its place.
 
 from __future__ import annotations
 
+import re
 from enum import Enum
 
 from msgspec import Struct
@@ -161,6 +162,33 @@ EARLIER = {
 }
 
 
+#: Profile → the editors whose projects its files are for, by the number that begins their version; 6000 is Unity 6.
+EDITORS = {
+    "unity6": ("2023", "6000"),
+    "barracuda-3": ("2020", "2021", "2022"),
+    "barracuda-1.4": ("2019", "2020", "2021"),
+    "barracuda-1.0": ("2018", "2019", "2020"),
+}
+
+
+def purpose_text(releases: str, profile: str, engine: str) -> str:
+    """Return what a profile is for: releases of ML-Agents, the editors, the runtime there."""
+    first, *_, last = EDITORS[profile]
+    editors = f"{first} and Unity 6" if last == "6000" else f"{first} to {last}"
+    return f"{releases} in Unity {editors} ({engine})"
+
+
+def editor_hint(version: str) -> str | None:
+    """Return which releases an editor's version may stand for, and their profiles; None where it is not one."""
+    found = re.fullmatch(r"(?:unity ?)?(20\d\d|6000|6(?=\.|$))(\..*)?", version.strip().lower())
+    editor = "" if found is None else {"6": "6000"}.get(found[1], found[1])
+    rows = [c for c in (*CONSUMERS.values(), *EARLIER.values()) if editor in EDITORS[c.profile]]
+    if not rows:
+        return None
+    told = ", ".join(f"{c.package} on {c.runtime} (--unity {c.name}, --for {c.profile})" for c in rows)
+    return f"it is a version of the editor; a project there may have {told}"
+
+
 def releases_for(profile: str) -> tuple[Consumer, ...]:
     """Return the releases whose checks are known that a profile writes for, the oldest first."""
     return tuple(c for c in CONSUMERS.values() if c.profile == profile)
@@ -172,4 +200,11 @@ def consumer(name: str) -> Consumer:
     for known, found in every.items():
         if known.lower() == name.strip().lower():
             return found
-    raise UsageError(f"--unity {name}: not a release whose rules are known", fix=f"one of {', '.join(every)}")
+    why = editor_hint(name)
+    raise UsageError(
+        f"--unity {name}: not a release whose rules are known",
+        why=why,
+        fix=f"one of {', '.join(c.title for c in every.values())}"
+        if why is None
+        else "choose by the versions in the project's Packages/manifest.json",
+    )
