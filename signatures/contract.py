@@ -53,14 +53,28 @@ _Sensor = Annotated[tuple[Annotated[int, Meta(ge=1, le=2**63 - 1)], ...], Meta(m
 
 
 class FileEntry(Record, frozen=True, rename={"size": "bytes"}):
-    """One file of a bundle: the sha256 of its bytes (hexadecimal) and how many they are."""
+    """One file of a bundle.
+
+    - ``sha256``: SHA-256 of the file's bytes, in hexadecimal.
+    - ``bytes``: the file's size in bytes.
+    """
 
     sha256: _Sha256
     size: Count
 
 
 class Origin(Record, frozen=True):
-    """Where a policy comes from: the source's base name and sha256, which model of it, how it was read."""
+    """Where a policy comes from, and how its source was read; fields beside these say how it is run, and are internal.
+
+    - ``path``: base name of the file.
+    - ``sha256``: SHA-256 of the file's bytes, in hexadecimal.
+    - ``model``: which of a source's policies it is.
+    - ``step``: step of the checkpoint (--step).
+    - ``sensors``: shapes of the agent's sensors (--sensors).
+    - ``goals``: which of the sensors are goals, by their place.
+    - ``activation``: activation between layers (--activation).
+    - ``normaliser``: file of the observations' statistics (--normaliser), or none.
+    """
 
     path: Text
     sha256: _Sha256
@@ -73,16 +87,31 @@ class Origin(Record, frozen=True):
 
 
 class Code(TypedDict, total=False):
-    """How source code was written, as far as it is not as usual."""
+    """How source code was written, where not as usual.
 
-    math: Annotated[str, one_of(CHOICES["math"])]
-    weights: Annotated[str, one_of(CHOICES["weights"])]
-    outputs: Annotated[str, one_of(CHOICES["outputs"])]
-    guard: Number
+    - ``math``: mathematical functions are the source code's own, the same bits on every processor (--math).
+    - ``weights``: weights are in a file beside the source code (--weights).
+    - ``outputs``: source code gives all outputs, not the actor's alone (--outputs).
+    - ``guard``: beyond how many deviations an observation is unusual (--guard).
+    """
+
+    math: Annotated[str, one_of(CHOICES["math"][1:])]
+    weights: Annotated[str, one_of(CHOICES["weights"][1:])]
+    outputs: Annotated[str, one_of(CHOICES["outputs"][1:])]
+    guard: Annotated[float, Meta(gt=0, le=1.7976931348623157e308, title="a finite number above 0")]
 
 
 class Tool(TypedDict):
-    """What wrote a bundle, and the options of the export."""
+    """What wrote a bundle, and the options of the export.
+
+    - ``name``: the program.
+    - ``version``: its version, as it says itself.
+    - ``profile``: the consumer that the files were made for (--for).
+    - ``weights``: what weights were rounded to and are kept in (--dtype, --quantize).
+    - ``batch``: for how many agents its .onnx and .tflite are (--batch); without it, for any number.
+    - ``code``: how source code was written, where not as usual.
+    - ``bake``: what of the interface its graph computes beside what the source does (--bake).
+    """
 
     name: Text
     version: Text
@@ -94,15 +123,26 @@ class Tool(TypedDict):
 
 
 class Preprocess(TypedDict):
-    """What must be done to an image before it is fed."""
+    """What must be done to an image before it is fed.
+
+    - ``layout``: the order of its axes.
+    - ``range``: lowest and highest value.
+    - ``from_bytes``: how bytes of 0 to 255 become such values.
+    """
 
     layout: Annotated[str, one_of(("NHWC", "NCHW"))]
     range: Annotated[list[Number], Meta(min_length=2, max_length=2)]
     from_bytes: Text
 
 
-class _Head(Struct, frozen=True):
-    """What a contract says beside the policy's signature."""
+class Head(Struct, frozen=True):
+    """What a contract says beside the policy's signature.
+
+    - ``name``: the policy's name, which its files have.
+    - ``source``: where it came from, and how the source is run to verify again.
+    - ``tool``: what wrote the bundle, and the options of the export.
+    - ``files``: the bundle's files, by path.
+    """
 
     name: _Name
     source: Origin
@@ -185,7 +225,7 @@ def parse(content: Any) -> Contract:
         raise FieldError(WHOLE, "must be an object")
     if content.get("schema") != SCHEMA:
         raise FieldError("schema", f"is {str(content.get('schema'))[:20]!r}, and this version reads {SCHEMA}")
-    head: _Head = read(content, _Head)
+    head: Head = read(content, Head)
     signature = parse_signature(content)
     for path in head.files:
         _check_path(path)
@@ -253,7 +293,11 @@ def parse_source_map(content: Any, signature: PolicySignature) -> SourceMap:
 
 
 class Normal(Struct, frozen=True, tag_field="kind", tag="normal"):
-    """Numbers about a mean; one for all, or one for each number of the input."""
+    """Numbers about a mean.
+
+    - ``mean``, ``std``: one for all, or one for each number of the input.
+    - ``clip``: at how many deviations the policy cuts them off; missing: nowhere.
+    """
 
     mean: Number | list[Number]
     std: Number | list[Number]
@@ -261,21 +305,31 @@ class Normal(Struct, frozen=True, tag_field="kind", tag="normal"):
 
 
 class Uniform(Struct, frozen=True, tag_field="kind", tag="uniform"):
-    """Numbers between two."""
+    """Numbers between two.
+
+    - ``low``, ``high``: the lowest and the highest.
+    """
 
     low: Number
     high: Number
 
 
 class Integer(Struct, frozen=True, tag_field="kind", tag="integer"):
-    """The lowest and highest id, or one pair for each number of the input; None where any integer goes."""
+    """Whole numbers, both ends included.
+
+    - ``low``, ``high``: one for all, or one for each number of the input; None where any integer goes.
+    """
 
     low: _Id | list[_Id | None] | None = None
     high: _Id | list[_Id | None] | None = None
 
 
 class Mask(Struct, frozen=True, tag_field="kind", tag="mask"):
-    """What a mask says of an action that is allowed, and of one that is not."""
+    """A mask's numbers.
+
+    - ``allowed``: that of an action that is allowed.
+    - ``forbidden``: that of one that is not.
+    """
 
     allowed: Annotated[int, Meta(ge=0, le=1)]
     forbidden: Annotated[int, Meta(ge=0, le=1)]

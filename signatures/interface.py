@@ -34,9 +34,14 @@ _Names = Annotated[tuple[Text, ...], Meta(max_length=MAX_VALUES)]
 class Term(Record, frozen=True, kw_only=True, rename={"source": "from"}):
     """Numbers that stand side by side in an observation or an action.
 
-    ``size`` counts those of one frame, ``history`` the frames (1: the present alone); None where no source says it.
-    ``scale``, ``offset`` and ``clip`` have one entry for all numbers, or one for each; none: nothing is stated.
-    ``source`` is the file and the key.
+    - ``name``: its name.
+    - ``size``: numbers of one frame; missing where no source says it.
+    - ``elements``: a name for each number.
+    - ``unit``: unit of all numbers.
+    - ``scale``, ``offset``: one for all numbers, or one for each; missing: none is stated.
+    - ``clip``: lowest and highest value, for all numbers or for each; None: not bounded.
+    - ``history``: frames; 1: the present alone.
+    - ``from``: the file and the key that state it.
     """
 
     name: Text
@@ -61,7 +66,15 @@ class Term(Record, frozen=True, kw_only=True, rename={"source": "from"}):
 
 
 class Quantity(Record, frozen=True, kw_only=True, rename={"source": "from"}):
-    """Numbers beside inputs and outputs that a caller needs: gains, a default pose; with ``clip``, limits."""
+    """Numbers beside inputs and outputs that a caller needs: gains, a default pose, limits.
+
+    - ``name``: what it is.
+    - ``values``: the numbers.
+    - ``clip``: lowest and highest values.
+    - ``elements``: what each number belongs to.
+    - ``unit``: their unit.
+    - ``from``: the file and the key that state it.
+    """
 
     name: Text
     values: _Values = ()
@@ -72,14 +85,22 @@ class Quantity(Record, frozen=True, kw_only=True, rename={"source": "from"}):
 
 
 class Statement(Record, frozen=True, rename={"source": "from"}):
-    """A sentence, or a key's text, and the file and key that it is from."""
+    """A sentence, or a key's text.
+
+    - ``text``: the sentence, or the key's text.
+    - ``from``: the file and the key that state it.
+    """
 
     text: Blank
     source: Text
 
 
 class Period(Record, frozen=True, rename={"source": "from"}):
-    """Seconds from one decision to the next, and where that is stated."""
+    """Time from one decision to the next.
+
+    - ``seconds``: seconds.
+    - ``from``: the file and the key that state it.
+    """
 
     seconds: Annotated[float, Meta(gt=0, le=1.7976931348623157e308, title="a finite number above 0")]
     source: Text
@@ -93,11 +114,15 @@ _Statements = Annotated[tuple[Statement, ...], Meta(max_length=MAX_TERMS)]
 class Interface(Record, frozen=True):
     """What sources state of a policy's inputs and outputs, and of its control loop.
 
-    - ``observations``: input → its terms, in order; ``actions``: the terms of the continuous action.
-    - ``baked``: the actions' terms whose scale, offset and clip the graph applies; ``actions`` lacks them then.
-    - ``resets``: what makes an episode begin, or what the memory starts from.
-    - ``limits``, ``quantities``: limits and other numbers that a caller needs.
-    - ``kept``: keys that are not understood, as text. ``metadata``: a model's own, unchanged.
+    - ``observations``: input to its terms, in order: fed as clip(value - offset) × scale.
+    - ``actions``: terms of the continuous action: applied as clip(action × scale + offset).
+    - ``baked``: terms of the action that the graph computes already (--bake actions); ``actions`` lacks them then.
+    - ``period``: time from one decision to the next.
+    - ``resets``: what ends an episode, and what the memory starts from.
+    - ``limits``: limits, by name.
+    - ``quantities``: other numbers that a caller needs: gains, a default position.
+    - ``kept``: keys that are not understood, as text.
+    - ``metadata``: the source's own ONNX metadata, unchanged.
     """
 
     observations: Mapping[Text, _Terms] = field(default_factory=dict)

@@ -7,7 +7,9 @@ As in policy.json: ``{"observations": {NAME: [text per number]}, "branches": [[t
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypedDict
+
+from msgspec import Meta
 
 from signatures.errors import UsageError
 from signatures.roles import Role
@@ -18,6 +20,20 @@ if TYPE_CHECKING:
 #: What one text may hold: it is shown on a line, in a page and in comments of code.
 MAX_LENGTH = 120
 PARTS = ("observations", "actions", "branches")
+_Texts = Annotated[list[Annotated[str, Meta(min_length=1, max_length=MAX_LENGTH)]], Meta(min_length=1)]
+
+
+class Labels(TypedDict, total=False):
+    """Names that people gave to observations and actions.
+
+    - ``observations``: vector observation to one text per number.
+    - ``actions``: one text per continuous action.
+    - ``branches``: one text per action, by branch.
+    """
+
+    observations: dict[str, _Texts]
+    actions: _Texts
+    branches: list[_Texts]
 
 
 def parse_labels(content: Any) -> dict[str, Any]:

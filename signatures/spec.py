@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import numpy as np
 from msgspec import Meta, Struct, field
 
-from signatures.fields import Many, Number, Record, Shape, Size, Text, Whole, explicit_default, one_of
+from signatures.fields import Many, Number, Record, Shape, Text, Whole, explicit_default, one_of
 from signatures.interface import Interface
 from signatures.memories import SourcePart
 from signatures.roles import OBSERVATIONS, Role
@@ -24,9 +24,13 @@ Dtype = Annotated[str, one_of(DTYPES)]
 class TensorSpec(Record, frozen=True):
     """One input or output.
 
-    ``shape`` has None for a free axis (the batch comes first). ``dtype`` is numpy's name. ``source`` is the tensor of
-    the source it stands for (``"vector_observation:0"``), a tuple of them where several were joined, None where it
-    was made here. ``distribution`` describes what an input looks like: ``{"kind": "normal", "mean": […], "std": […]}``.
+    - ``name``: its name.
+    - ``role``: what it is for.
+    - ``dtype``: numpy's name.
+    - ``shape``: None is a free axis; the batch comes first.
+    - ``source``: its tensor in the source (``"vector_observation:0"``); several where they were joined, None where it
+      was made here.
+    - ``distribution``: what an input looks like.
     """
 
     name: Text
@@ -67,14 +71,16 @@ class TensorSpec(Record, frozen=True):
 
 
 class Memory(Record, frozen=True):
-    """Recurrent state: ``size`` floats per agent, fed as ``input`` and read from ``output``.
+    """The recurrent state.
 
-    ``output`` is None where the source has lost it. ``layout`` names its parts in order, for example ``("c", "h")``, or
-    is empty where it is unknown. ``others`` are further (input, output) pairs of a memory in several tensors, a part of
-    ``layout`` each.
+    - ``size``: floats per agent.
+    - ``input``: the input that takes it.
+    - ``output``: the output that gives it; None where the source has lost it.
+    - ``layout``: its parts in order, such as c and h; empty where they are unknown.
+    - ``others``: further pairs of input and output, of a memory in several tensors, a part of ``layout`` each.
     """
 
-    size: Size
+    size: Annotated[int, Meta(ge=1, le=2**31 - 1)]
     input: Text | None
     output: Text | None
     layout: Many[Text] = explicit_default(tuple)
@@ -105,10 +111,24 @@ def _companion(head: TensorSpec, plain: Sequence[TensorSpec], heads: int) -> Ten
 
 
 class PolicySignature(Record, frozen=True, kw_only=True):
-    """The contract of a policy, the same in every format it is written to."""
+    """The contract of a policy, the same in every format it is written to.
+
+    - ``family``: which generation of ML-Agents, or which trainer, wrote the source.
+    - ``algorithm``: PPO, SAC, POCA, BC, DQN where the graph tells it.
+    - ``action_space``: continuous, discrete or hybrid.
+    - ``inputs``: the policy's inputs, in order.
+    - ``outputs``: the policy's outputs, in order: actions first.
+    - ``memory``: the recurrent state; None where the policy has none.
+    - ``branches``: number of actions of each discrete branch.
+    - ``preprocess``: by input, what must be done to an image before it is fed.
+    - ``constants``: what the trainer stored beside the policy.
+    - ``notes``: what is to be known beside the figures, as sentences.
+    - ``labels``: names that people gave to observations and actions (--labels); missing where they gave none.
+    - ``interface``: what the source and the files beside it state of the numbers (docs/interface.md); missing where
+      nothing does.
+    """
 
     family: Text
-    #: The training algorithm where the graph tells it: PPO, SAC, POCA, BC, DQN.
     algorithm: Text | None = explicit_default(lambda: None)
     action_space: Annotated[str, one_of(("continuous", "discrete", "hybrid"))]
     inputs: Many[TensorSpec]
@@ -118,9 +138,7 @@ class PolicySignature(Record, frozen=True, kw_only=True):
     preprocess: Mapping[str, Any] = explicit_default(dict)
     constants: Mapping[Text, Number | list[Whole]] = explicit_default(dict)
     notes: Many[Text] = explicit_default(tuple)
-    #: Names that people gave to observations and actions (signatures/labels.py); empty where they gave none.
     labels: Mapping[str, Any] = field(default_factory=dict)
-    #: What sources state of units, scales and the control loop; None where none states anything.
     interface: Interface | None = None
 
     def __repr__(self) -> str:

@@ -58,7 +58,7 @@ def signatures(draw: st.DrawFn) -> PolicySignature:
     name = st.none() | st.sampled_from([s.name for s in inputs]) if inputs else st.none()
     memory = st.builds(
         Memory,
-        size=st.integers(0, 512),
+        size=st.integers(1, 512),
         input=name,
         output=st.none() | st.sampled_from([s.name for s in outputs]),
         layout=st.lists(st.sampled_from("ch"), max_size=4).map(tuple),
