@@ -19,6 +19,7 @@ from signatures.roles import Q_NAMES, STATE_VALUE_NAMES, plain_name
 _ACTION_NAMES = re.compile(
     r"(.*_)?(actions?|act|actor|mean|mu|pi|policy|controls?|steering|throttle|logits|probs?)(_.*)?"
 )
+_SCORES = re.compile(r"(action_)?logits")
 #: Names of networks, and of the last layers of networks, that value actions …
 _Q_NETWORKS = re.compile(
     r"(.*_)?(d+qn|dueling|q_?net(work)?|q_?func(tion)?|deep_?q|q_?values?|categorical_?q(_?network)?)(_.*)?"
@@ -99,6 +100,11 @@ EVIDENCE = (
         _trained_by_regression,
     ),
 )
+
+
+def is_scores(name: str) -> bool:
+    """Whether an output is called as scores of a choice."""
+    return _SCORES.fullmatch(plain_name(name)) is not None
 
 
 def is_q_name(name: str) -> bool:

@@ -240,7 +240,11 @@ def test_logits_beside_a_value_are_the_action(tmp_path: Path) -> None:
     signature = compiled(message, tmp_path).signature
     sources = {s.source: s.name for s in signature.outputs}
     assert (sources["logits"], sources["value"]) == ("action", "value_estimate")
-    assert any("scores of a choice" in note for note in signature.notes)
+    (note,) = signature.notes
+    assert "scores of a choice" in note and "as continuous actions" in note
+    chosen = compiled(message, tmp_path, outputs={"logits": Role.Q_VALUES, "value": Role.VALUE}).signature
+    assert note.endswith("--output logits=q_values") and (chosen.action_space, chosen.branches) == ("discrete", (4,))
+    assert not compiled(message, tmp_path, outputs={"logits": Role.ACTION}).signature.notes
 
 
 @pytest.mark.parametrize("other", ["logits", "mean", "policy"])

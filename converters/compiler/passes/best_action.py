@@ -15,6 +15,7 @@ from converters.policy.action_values import (
     Candidate,
     evidence_of,
     is_q_name,
+    is_scores,
     is_state_value,
     last_layer,
     may_be_values,
@@ -51,6 +52,13 @@ def rank_actions(c: Compilation) -> Compilation:
         )
     if width is None or width == 1:
         return c
+    if is_scores(given.name):
+        return _add_note(
+            c,
+            f"{given.name} are scores of a choice by their name, not normalised, and nothing tells how many branches "
+            "they are of; they are exported as they are, as continuous actions; if the largest is the action: "
+            f"--output {given.name}=q_values",
+        )
     evidence = evidence_of(given)
     if evidence is None:
         return _add_note(
@@ -86,7 +94,7 @@ def _is_open(c: Compilation) -> bool:
     if is_q_name(name):
         return True
     masked = Role.MASKS in c.roles.values()
-    return not says_action(name) and not masked and may_be_values(c.graph, tensor)
+    return (is_scores(name) or not says_action(name)) and not masked and may_be_values(c.graph, tensor)
 
 
 def _candidate(c: Compilation) -> Candidate:

@@ -9,13 +9,12 @@ from msgspec import Struct
 
 from converters.formats.onnx.reader import OnnxModel
 from converters.graph.types import Dim
-from converters.policy.action_values import is_q_name
+from converters.policy.action_values import is_q_name, is_scores
 from converters.policy.rules import Decision, Rule, against, first
 from signatures.roles import OUTPUT_NAMES, STATE_VALUE_NAMES, Role
 
 #: What other trainers call the action and the value: rsl_rl (actions), Stable-Baselines3, CleanRL, plain PyTorch.
 _ACTION = re.compile(r"actions?|act|action_mean|mean_actions?|action_logits|logits|outputs?|mean|mu|pi|policy")
-_SCORES = re.compile(r"(action_)?logits")
 #: ... and the spread of a Gaussian action (rl_games, skrl, tianshou, CleanRL), its logarithm, the log-probability.
 _STD = re.compile(r"(action_?)?(std|stddev|std_dev|sigma|scale)s?")
 _LOG_STD = re.compile(r"(action_?)?log_?(std|stddev|std_dev|sigma|scale)s?")
@@ -145,11 +144,6 @@ def _plainest(found: dict[str, Decision], outputs: Sequence[Output]) -> list[str
                 )
             return fitting
     return [o.node for o in outputs]
-
-
-def is_scores(node: str) -> bool:
-    """Whether an output is called as scores of a choice."""
-    return _SCORES.fullmatch(_base(node)) is not None
 
 
 def _base(node: str) -> str:

@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from converters.formats.bundle.embed import contract_of, redrawn
 from converters.formats.bundle.embed import facts_of as facts_of_contract
-from converters.formats.onnx.output_roles import is_scores, output_roles, positional
+from converters.formats.onnx.output_roles import output_roles, positional
 from converters.formats.onnx.reader import OnnxModel
 from converters.formats.onnx.tensor_map import TENSORS_KEY
 from converters.graph.nodes import Graph, NameScope, Node, topological
@@ -63,7 +63,7 @@ def understand(model: OnnxModel) -> tuple[Graph, SourceFacts]:
         roles = {n: d.role for n, d in decisions.items()}
         graph = _with_spreads(model, graph, roles)
         notes += _notes_of_constants(model, roles)
-        facts = replace(facts, family="own model", outputs=roles, notes=_notes_of_others(model, roles))
+        facts = replace(facts, family="own model", outputs=roles, notes=_notes_of_others(model))
         facts = replace(facts, decisions={**model.decisions, **decisions})
         if positional(model):
             facts = replace(facts, family="Stable-Baselines3")
@@ -180,7 +180,7 @@ def _with_spreads(model: OnnxModel, graph: Graph, roles: Mapping[str, Role | Non
     return graph
 
 
-def _notes_of_others(model: OnnxModel, roles: Mapping[str, Role | None]) -> tuple[str, ...]:
+def _notes_of_others(model: OnnxModel) -> tuple[str, ...]:
     if not positional(model):
         names = [n.lower() for n in (*model.inputs, *model.outputs)]
         if not any(_OF_A_POLICY.search(n) for n in names):
@@ -188,8 +188,7 @@ def _notes_of_others(model: OnnxModel, roles: Mapping[str, Role | None]) -> tupl
                 "nothing marks this file as a policy: no input or output has a name that trainers give "
                 f"({', '.join((*model.inputs, *model.outputs))}); what it computes is exported all the same",
             )
-        scores = [n for n, role in roles.items() if role is Role.ACTION and is_scores(n)]
-        return tuple(f"{n} are scores of a choice, not normalised: the best is the largest" for n in scores)
+        return ()
     names = list(model.outputs)
     order = f"{names[0]} is the action, {names[1]} the value"
     return (f"outputs by their order, as Stable-Baselines3's policies give them: {order}",)
