@@ -13,11 +13,12 @@ import numpy as np
 from msgspec import Struct, field
 from msgspec.structs import replace
 
-from converters.graph.nodes import Graph, Node, node_of, normal_ref, split_ref
+from converters.graph.nodes import Graph, Node, node_of
 from converters.graph.ops.table import CONTROL_FLOW, is_fed, passes_on, traits
+from converters.policy.given_outputs import check_given, outputs_from_user
 from converters.policy.memories import looks_like_state
 from converters.policy.rules import Decision, Rule
-from signatures.errors import NotAPolicyError, SignatureError, UsageError
+from signatures.errors import NotAPolicyError, SignatureError
 from signatures.roles import (
     ACTING,
     ACTION_NAMES,
@@ -25,7 +26,6 @@ from signatures.roles import (
     CONSTANT_NAMES,
     LISTED_CONSTANTS,
     OUTPUT_NAMES,
-    OUTPUT_ROLES,
     Q_NAMES,
     Constant,
     Role,
@@ -254,7 +254,7 @@ def _shows_one_of(graph: Graph, name: str, nodes: Collection[str]) -> bool:
 def _brains_from_user(
     graph: Graph, wanted: Mapping[str, Role], declared: Mapping[str, Role | None] | None, told: Mapping[str, Decision]
 ) -> tuple[Brain, ...]:
-    outputs = _outputs_from_user(graph, wanted)
+    outputs = outputs_from_user(graph, wanted)
     nodes = {node_of(reference) for _, _, reference in outputs}
     acted = {n for n, role in (declared or {}).items() if role is Role.ACTION} | {
         n.name for n in graph.nodes if n.name.rpartition("/")[2] in ACTION_NAMES and not declared
@@ -264,11 +264,16 @@ def _brains_from_user(
     if Role.ACTION in given or (Role.Q_VALUES in given and not acted):
         scope = _scope_of(graph, [node_of(reference) for _, _, reference in outputs])
         says = {reference: _TOLD for _, _, reference in outputs}
-        return (Brain(scope, tuple(outputs), _constants(graph, scope), says=says),)
+        brains: tuple[Brain, ...] = (Brain(scope, tuple(outputs), _constants(graph, scope), says=says),)
+        check_given(outputs, [role for _, role, _ in outputs], brains[0].canonical)
+        return brains
     # Naming one output is enough to say that the rest is where it always is.
     named = {reference for _, _, reference in outputs}
     rest = {n: role for n, role in (declared or {}).items() if n not in named}
-    return _give_outputs(find_brains(graph, declared=rest or declared, told=told), outputs)
+    brains = _give_outputs(find_brains(graph, declared=rest or declared, told=told), outputs)
+    for brain in brains:
+        check_given(outputs, [role for _, role, _ in brain.outputs], brain.canonical)
+    return brains
 
 
 def _give_outputs(brains: tuple[Brain, ...], outputs: Sequence[tuple[str, Role, str]]) -> tuple[Brain, ...]:
@@ -291,44 +296,11 @@ def _give_outputs(brains: tuple[Brain, ...], outputs: Sequence[tuple[str, Role, 
     )
 
 
-def _outputs_from_user(graph: Graph, wanted: Mapping[str, Role]) -> list[tuple[str, Role, str]]:
-    """Return (name, role, reference) of each output of ``--output``. Raises UsageError."""
-    outputs: list[tuple[str, Role, str]] = []
-    for name, role in wanted.items():
-        node_name, _ = split_ref(name)
-        if node_name not in graph:
-            raise UsageError(
-                f"--output names {name!r}, which is not in the graph",
-                why=close_names(node_name, [n.name for n in graph.nodes]),
-                fix="export-model inspect FILE lists the outputs that were found",
-            )
-        if role not in OUTPUT_ROLES:
-            roles = ", ".join(OUTPUT_ROLES)
-            raise UsageError(f"--output {name}={role}: that is not an output's role", fix=f"one of: {roles}")
-        outputs.append((node_name.rsplit("/", 1)[-1], role, normal_ref(name)))
-    values = [reference for _, role, reference in outputs if role is Role.Q_VALUES]
-    if len(values) > 1:
-        raise UsageError(
-            f"--output says that {len(values)} outputs are values of actions: {', '.join(values)}",
-            why="the action is the best of one of them",
-            fix="give the role q_values to that one, and other to the rest",
-        )
-    return outputs
-
-
 def _scope_of(graph: Graph, names: Sequence[str]) -> str:
     """The scope of a brain whose outputs are ``names``: the one they share, if a placeholder is in it, too."""
     parents = {name.rpartition("/")[0] for name in names}
     scope = f"{parents.pop()}/" if len(parents) == 1 else "/"
     return scope if any(is_fed(n) and n.name.startswith(scope) for n in graph.nodes) else ""
-
-
-def close_names(name: str, names: Sequence[str]) -> str | None:
-    """What may have been meant by a name that is not there."""
-    import difflib
-
-    near = difflib.get_close_matches(name, names, n=3)
-    return f"close to it: {', '.join(near)}" if near else None
 
 
 def _brain_of_sink(

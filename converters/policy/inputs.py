@@ -11,7 +11,8 @@ from msgspec.structs import replace
 
 from converters.graph.nodes import Graph, Node, node_of
 from converters.graph.ops.table import is_fed
-from converters.policy.brains import Brain, close_names
+from converters.policy.brains import Brain
+from converters.policy.given_outputs import close_names
 from converters.policy.input_rules import (
     BY_NAME,
     BY_READERS,

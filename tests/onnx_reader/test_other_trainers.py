@@ -247,6 +247,26 @@ def test_logits_beside_a_value_are_the_action(tmp_path: Path) -> None:
     assert not compiled(message, tmp_path, outputs={"logits": Role.ACTION}).signature.notes
 
 
+@pytest.mark.parametrize("role", [Role.VALUE, Role.ACTION_PROBS, Role.OTHER])
+def test_the_only_action_cannot_be_told_to_be_something_else(role: Role, tmp_path: Path) -> None:
+    message = model(
+        [node("MatMul", ["obs", "w"], "out")], {"obs": (np.float32, ["b", 3])}, ["out"], {"w": floats(3, 4)}
+    )
+    with pytest.raises(SignatureError, match=f"--output out={role} leaves no action"):
+        compiled(message, tmp_path, outputs={"out": role})
+
+
+@pytest.mark.parametrize("told", [{"value": Role.VALUE, "other": Role.VALUE}, {"other": Role.VALUE}])
+def test_one_role_for_two_outputs_is_refused_by_name(told: dict[str, Role], tmp_path: Path) -> None:
+    nodes = [node("MatMul", ["obs", n], o) for n, o in (("w", "action"), ("v", "value"), ("u", "other"))]
+    weights = {"w": floats(3, 2), "u": floats(3, 1), "v": floats(3, 1)}
+    message = model(nodes, {"obs": (np.float32, ["b", 3])}, ["action", "value", "other"], weights)
+    for given in (told, {"action": Role.ACTION, "value": Role.VALUE} | told):
+        with pytest.raises(SignatureError, match="gives one role to 2 outputs") as caught:
+            compiled(message, tmp_path, outputs=given)
+        assert "=other" in (caught.value.fix or "")
+
+
 @pytest.mark.parametrize("other", ["logits", "mean", "policy"])
 def test_beside_an_action_nothing_else_is_one_and_nothing_is_lost(other: str, tmp_path: Path) -> None:
     nodes = [node("MatMul", ["obs", n], o) for n, o in (("w", "action"), ("u", other), ("v", "value"))]
