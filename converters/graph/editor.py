@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from converters.graph.builder import Builder
 from converters.graph.nodes import Graph, NameScope, Node, SourceName, topological
-from converters.graph.ops.base import Older, Shape
+from converters.graph.ops.rewriting import Older, Shape
 from converters.graph.ops.table import is_fed, op_of
 from converters.graph.shapes import add_types
 from converters.graph.types import TensorType

@@ -6,7 +6,8 @@ from collections.abc import Callable, Collection
 
 from converters.graph.editor import Editor
 from converters.graph.nodes import Graph
-from converters.graph.ops.base import OpDef, Tfjs
+from converters.graph.ops.base import OpDef
+from converters.graph.ops.rewriting import Tfjs
 from converters.graph.ops.table import op_of
 from converters.graph.shapes import infer_types
 

@@ -13,7 +13,8 @@ import numpy as np
 
 from converters.graph.nn.choosing import MAX_TABLE
 from converters.graph.nodes import Node, ref
-from converters.graph.ops.base import Decomposition, GraphBuilder, Tfjs, axis_within
+from converters.graph.ops.base import axis_within
+from converters.graph.ops.rewriting import Decomposition, GraphBuilder, Tfjs
 from converters.graph.types import BATCH, BOOL, FLOAT32, INT32, TensorType
 from signatures.errors import UnsupportedOpError
 

@@ -9,10 +9,10 @@ import numpy as np
 from msgspec.structs import replace
 
 from converters.graph.nodes import Node
+from converters.graph.ops.activations import FUSED, apply_activations, lower_activated
 from converters.graph.ops.base import (
     REQUIRED,
     Attr,
-    GraphBuilder,
     Kernel,
     Lower,
     OnnxBuilder,
@@ -23,12 +23,12 @@ from converters.graph.ops.base import (
     shape_error,
     type_attr,
 )
-from converters.graph.ops.linear import FUSED, apply_activations, lower_activated
 from converters.graph.ops.litert.base import Litert
 from converters.graph.ops.litert.layers import conv2d, depthwise, pad, pool
 from converters.graph.ops.loops import arrays
 from converters.graph.ops.loops import layers as loops
 from converters.graph.ops.loops.layers import window_padding
+from converters.graph.ops.rewriting import GraphBuilder
 from converters.graph.types import INT32, Dim, Symbols, TensorType
 
 T = type_attr()

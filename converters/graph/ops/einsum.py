@@ -7,7 +7,7 @@ from string import ascii_letters
 
 import numpy as np
 
-from converters.graph.ops.base import NodeBuilder, Shape
+from converters.graph.ops.rewriting import NodeBuilder, Shape
 from converters.graph.types import INT32, Dim
 from signatures.errors import UnsupportedOpError
 

@@ -1,4 +1,4 @@
-"""Elementwise ops: arithmetic, activations, casts; comparisons and choices stand in ``logic``.
+"""Elementwise ops: functions, casts, arithmetic. Others stand in ``activations`` and ``logic``.
 
 Kernels of transcendental functions compute in float64 and round once, so constant folding gives the same bytes on
 every processor, and the oracle is closer to the true value than any runtime it judges.
@@ -17,7 +17,6 @@ from converters.graph.ops import barracuda
 from converters.graph.ops.base import (
     REQUIRED,
     Attr,
-    GraphBuilder,
     Lower,
     OnnxBuilder,
     OpDef,
@@ -33,13 +32,14 @@ from converters.graph.ops.litert import elementwise as litert
 from converters.graph.ops.litert.base import builtin, steps
 from converters.graph.ops.loops import elementwise as loops
 from converters.graph.ops.loops.base import elementwise, simple
-from converters.graph.ops.older import clip, leaky_relu
+from converters.graph.ops.older import clip
+from converters.graph.ops.rewriting import GraphBuilder
 from converters.graph.types import BOOL, INT32, INT64, Symbols, TensorType
 
 T = type_attr()
 
 
-def _wide(function: Callable[..., np.ndarray]) -> Callable[..., np.ndarray]:
+def wide(function: Callable[..., np.ndarray]) -> Callable[..., np.ndarray]:
     """A kernel that computes floats in float64 and rounds once to the dtype of the first operand."""
 
     def kernel(node: Node, *arrays: np.ndarray) -> np.ndarray:
@@ -50,35 +50,18 @@ def _wide(function: Callable[..., np.ndarray]) -> Callable[..., np.ndarray]:
     return kernel
 
 
-def _sigmoid(x: np.ndarray) -> np.ndarray:
-    small = np.exp(-np.abs(x))
-    return np.asarray(np.where(x >= 0, 1.0, small) / (1 + small))
-
-
-def _elu(x: np.ndarray) -> np.ndarray:
-    return np.where(x > 0, x, np.expm1(np.minimum(x, 0.0)))
-
-
-def _selu(x: np.ndarray) -> np.ndarray:
-    alpha, scale = 1.6732632423543772, 1.0507009873554805
-    return np.asarray(scale * np.where(x > 0, x, alpha * np.expm1(np.minimum(x, 0))))
-
-
 _erf = np.vectorize(math.erf, otypes=[np.float64])
 
 
-def _unary(name: str, kernel: Callable[..., np.ndarray], lower: str | Lower, **traits: Any) -> OpDef:
+def unary(name: str, kernel: Callable[..., np.ndarray], lower: str | Lower, **traits: Any) -> OpDef:
+    """A function of one operand; ``lower`` is what ONNX calls it, or how it is written there."""
     lowering = direct(lower) if isinstance(lower, str) else lower
     return OpDef(name, same_as(0, count=1), kernel, lowering, (T,), elementwise=True, **traits)
 
 
-def _smooth(name: str, function: Callable[..., np.ndarray], lower: str | Lower = "", **traits: Any) -> OpDef:
+def smooth(name: str, function: Callable[..., np.ndarray], lower: str | Lower = "", **traits: Any) -> OpDef:
     """A function that each runtime approximates; ONNX calls it so unless ``lower`` says how it is written."""
-    return _unary(name, _wide(function), lower or name, precision="approximate", **traits)
-
-
-def _clamp(name: str, function: Callable[..., np.ndarray], lower: str | Lower, **traits: Any) -> OpDef:
-    return _unary(name, plain(function), lower, precision="exact", tfjs_fuses=True, **traits)
+    return unary(name, wide(function), lower or name, precision="approximate", **traits)
 
 
 def _binary(name: str, function: Callable[..., np.ndarray], lower: str | Lower, **traits: Any) -> OpDef:
@@ -146,10 +129,6 @@ def _lower_floor_mod(node: Node, builder: OnnxBuilder) -> Any:
     return builder.emit("Where", [builder.emit("And", [left, signs]), builder.emit("Add", [rest, b]), rest])
 
 
-def _leaky_relu(node: Node, x: np.ndarray) -> np.ndarray:
-    return np.where(x > 0, x, x * x.dtype.type(node.attrs["alpha"]))
-
-
 def _cast(node: Node, x: np.ndarray) -> np.ndarray:
     with np.errstate(all="ignore"):
         return np.asarray(x.astype(node.attrs["DstT"]))
@@ -190,9 +169,9 @@ def _tfjs_cast(builder: GraphBuilder, node: Node, types: Mapping[str, TensorType
 
 
 UNARY = (
-    _unary("Neg", plain(np.negative), "Neg", loops=simple("neg"), litert=builtin("NEG"), precision="exact"),
-    _unary("Abs", plain(np.abs), "Abs", loops=simple("abs"), litert=builtin("ABS"), precision="exact"),
-    _unary(
+    unary("Neg", plain(np.negative), "Neg", loops=simple("neg"), litert=builtin("NEG"), precision="exact"),
+    unary("Abs", plain(np.abs), "Abs", loops=simple("abs"), litert=builtin("ABS"), precision="exact"),
+    unary(
         "Sign",
         plain(np.sign),
         "Sign",
@@ -201,8 +180,8 @@ UNARY = (
         litert=builtin("SIGN"),
         precision="exact",
     ),
-    _unary("Square", plain(np.square), _lower_square, loops=elementwise(loops.square), litert=litert.square),
-    _unary(
+    unary("Square", plain(np.square), _lower_square, loops=elementwise(loops.square), litert=litert.square),
+    unary(
         "Reciprocal",
         plain(np.reciprocal),
         "Reciprocal",
@@ -210,9 +189,9 @@ UNARY = (
         loops=elementwise(loops.reciprocal),
         litert=litert.reciprocal,
     ),
-    _unary("Floor", plain(np.floor), "Floor", loops=simple("floor"), litert=builtin("FLOOR"), precision="exact"),
-    _unary("Ceil", plain(np.ceil), "Ceil", loops=simple("ceil"), litert=builtin("CEIL"), precision="exact"),
-    _unary(
+    unary("Floor", plain(np.floor), "Floor", loops=simple("floor"), litert=builtin("FLOOR"), precision="exact"),
+    unary("Ceil", plain(np.ceil), "Ceil", loops=simple("ceil"), litert=builtin("CEIL"), precision="exact"),
+    unary(
         "Round",
         plain(np.rint),
         "Round",
@@ -221,8 +200,8 @@ UNARY = (
         litert=builtin("ROUND"),
         precision="exact",
     ),
-    _smooth("Exp", np.exp, loops=simple("exp"), litert=builtin("EXP")),
-    _smooth(
+    smooth("Exp", np.exp, loops=simple("exp"), litert=builtin("EXP")),
+    smooth(
         "Expm1",
         np.expm1,
         chain(("Exp", None), ("Sub", 1.0)),
@@ -230,8 +209,8 @@ UNARY = (
         loops=simple("expm1"),
         litert=litert.expm1,
     ),
-    _smooth("Log", np.log, loops=simple("log"), litert=builtin("LOG")),
-    _smooth(
+    smooth("Log", np.log, loops=simple("log"), litert=builtin("LOG")),
+    smooth(
         "Log1p",
         np.log1p,
         chain(("Add", 1.0), ("Log", None)),
@@ -239,8 +218,8 @@ UNARY = (
         loops=simple("log1p"),
         litert=steps(("ADD", 1.0), ("LOG", None)),
     ),
-    _unary("Sqrt", _wide(np.sqrt), "Sqrt", loops=simple("sqrt"), litert=builtin("SQRT")),
-    _smooth(
+    unary("Sqrt", wide(np.sqrt), "Sqrt", loops=simple("sqrt"), litert=builtin("SQRT")),
+    smooth(
         "Rsqrt",
         lambda x: np.asarray(1 / np.sqrt(x)),
         chain(("Sqrt", None), ("Reciprocal", None)),
@@ -248,65 +227,10 @@ UNARY = (
         loops=elementwise(loops.rsqrt),
         litert=builtin("RSQRT"),
     ),
-    _smooth("Sin", np.sin, loops=simple("sin"), litert=builtin("SIN")),
-    _smooth("Cos", np.cos, loops=simple("cos"), litert=builtin("COS")),
-    _smooth("Tan", np.tan, loops=simple("tan"), litert=litert.tan),
-    _smooth("Erf", _erf, barracuda=barracuda.ERF, loops=simple("erf"), litert=litert.erf),
-    _smooth(
-        "Sigmoid",
-        _sigmoid,
-        activation="sigmoid",
-        finite="always",
-        tfjs_fuses=True,
-        loops=elementwise(loops.sigmoid),
-        litert=builtin("LOGISTIC"),
-    ),
-    _smooth("Tanh", np.tanh, activation="tanh", finite="always", loops=simple("tanh"), litert=builtin("TANH")),
-    _clamp(
-        "Relu",
-        lambda x: np.maximum(x, x.dtype.type(0)),
-        "Relu",
-        activation="relu",
-        loops=elementwise(loops.relu),
-        litert=litert.activation("RELU"),
-    ),
-    _clamp(
-        "Relu6",
-        lambda x: np.clip(x, x.dtype.type(0), x.dtype.type(6)),
-        chain(("Max", 0.0), ("Min", 6.0)),
-        activation="relu 6",
-        loops=elementwise(loops.relu6),
-        litert=litert.activation("RELU6"),
-    ),
-    _smooth("Elu", _elu, activation="elu", tfjs_fuses=True, loops=elementwise(loops.elu), litert=builtin("ELU")),
-    _smooth("Selu", _selu, activation="selu", loops=elementwise(loops.selu), litert=litert.selu),
-    _smooth(
-        "Softplus",
-        lambda x: np.maximum(x, 0) + np.log1p(np.exp(-np.abs(x))),
-        activation="softplus",
-        barracuda=barracuda.SOFTPLUS,
-        loops=elementwise(loops.softplus),
-        litert=litert.softplus,
-    ),
-    _unary(
-        "Softsign",
-        _wide(lambda x: x / (1 + np.abs(x))),
-        "Softsign",
-        tfjs=barracuda.SOFTSIGN.write,  # TensorFlow.js 4.22 has none
-        activation="softsign",
-        barracuda=barracuda.SOFTSIGN,
-        loops=elementwise(loops.softsign),
-        litert=litert.softsign,
-    ),
-    OpDef(
-        "LeakyRelu",
-        same_as(0),
-        _leaky_relu,
-        attrs=(T, Attr("alpha", "float", 0.20000000298023224)),
-        older=leaky_relu,
-        activation="leaky relu",
-        elementwise=True,
-    ),
+    smooth("Sin", np.sin, loops=simple("sin"), litert=builtin("SIN")),
+    smooth("Cos", np.cos, loops=simple("cos"), litert=builtin("COS")),
+    smooth("Tan", np.tan, loops=simple("tan"), litert=litert.tan),
+    smooth("Erf", _erf, barracuda=barracuda.ERF, loops=simple("erf"), litert=litert.erf),
     OpDef(
         "Cast",
         _infer_cast,
@@ -398,7 +322,7 @@ BINARY = (
     OpDef(
         "Pow",
         broadcast_of(count=2),
-        _wide(np.power),
+        wide(np.power),
         direct("Pow"),
         (T,),
         loops=simple("pow"),

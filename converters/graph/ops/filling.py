@@ -13,7 +13,6 @@ from converters.graph.ops import barracuda
 from converters.graph.ops.arrays import target_dims
 from converters.graph.ops.base import (
     Attr,
-    GraphBuilder,
     OnnxBuilder,
     OpDef,
     by_shape,
@@ -33,6 +32,7 @@ from converters.graph.ops.litert.elementwise import full_like
 from converters.graph.ops.loops import arrays as loops
 from converters.graph.ops.loops.elementwise import full_of
 from converters.graph.ops.older import broadcast_to
+from converters.graph.ops.rewriting import GraphBuilder
 from converters.graph.types import INT32, Dim, Symbols, TensorType, broadcast, product
 
 T = type_attr()

@@ -11,7 +11,6 @@ from converters.graph.nodes import Node
 from converters.graph.ops import barracuda
 from converters.graph.ops.base import (
     Attr,
-    GraphBuilder,
     Lower,
     OnnxBuilder,
     OpDef,
@@ -29,6 +28,7 @@ from converters.graph.ops.litert.elementwise import select
 from converters.graph.ops.loops import elementwise as loops
 from converters.graph.ops.loops.base import Loops, elementwise, simple
 from converters.graph.ops.older import select_v2
+from converters.graph.ops.rewriting import GraphBuilder
 from converters.graph.types import BOOL, Symbols, TensorType
 
 T = type_attr()

@@ -8,8 +8,9 @@ import numpy as np
 
 from converters.graph.nn.choosing import top_k
 from converters.graph.nodes import Node, TensorShape, normal_ref, ref
-from converters.graph.ops.base import Attr, GraphBuilder, Older, OpDef, Shape, written_as_older
+from converters.graph.ops.base import Attr, OpDef, written_as_older
 from converters.graph.ops.einsum import einsum
+from converters.graph.ops.rewriting import GraphBuilder, Older, Shape
 from converters.graph.types import BOOL, FLOAT32, INT32
 from signatures.errors import UnsupportedOpError
 

@@ -13,10 +13,11 @@ import numpy as np
 
 from converters.graph.nodes import Node
 from converters.graph.ops.arrays import target_dims
-from converters.graph.ops.base import Attr, GraphBuilder, OnnxBuilder, OpDef, as_int64, not_constant, type_attr
+from converters.graph.ops.base import Attr, OnnxBuilder, OpDef, as_int64, not_constant, type_attr
 from converters.graph.ops.litert.arrays import sparse_to_dense
 from converters.graph.ops.litert.base import builtin
 from converters.graph.ops.loops import arrays as loops
+from converters.graph.ops.rewriting import GraphBuilder
 from converters.graph.types import INT64, Symbols, TensorType
 from signatures.errors import UnsupportedOpError
 

@@ -11,7 +11,6 @@ from converters.graph.nodes import Node
 from converters.graph.ops import barracuda
 from converters.graph.ops.base import (
     Attr,
-    GraphBuilder,
     OnnxBuilder,
     OpDef,
     axis_within,
@@ -30,6 +29,7 @@ from converters.graph.ops.litert.arrays import gather
 from converters.graph.ops.litert.base import LitertBuilder, Value, as_int32, ints, with_axis
 from converters.graph.ops.loops import arrays as loops
 from converters.graph.ops.loops.base import LoopBuilder, Tensor
+from converters.graph.ops.rewriting import GraphBuilder
 from converters.graph.types import Dim, Symbols, TensorType
 
 T = type_attr()

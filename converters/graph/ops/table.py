@@ -7,6 +7,7 @@ from typing import Protocol
 
 from converters.graph.nodes import Node
 from converters.graph.ops import (
+    activations,
     arrays,
     convolution,
     elementwise,
@@ -16,6 +17,7 @@ from converters.graph.ops import (
     logic,
     older,
     places,
+    reductions,
     samplers,
     slicing,
 )
@@ -92,7 +94,8 @@ CALLING = CALLS | WHILES | IFS
 
 def _table() -> Mapping[str, OpDef]:
     table: dict[str, OpDef] = {}
-    for module in (elementwise, logic, linear, convolution, arrays, joining, slicing, filling, places, samplers, older):
+    numbers = (elementwise, activations, logic, linear, convolution, reductions, samplers)
+    for module in (*numbers, arrays, joining, slicing, filling, places, older):
         for op in module.OPS:
             if op.name in table:
                 raise ValueError(f"op {op.name} stands twice in the table")

@@ -1,0 +1,122 @@
+"""Activations of networks, alone and as a part of a product or convolution."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from converters.graph.nodes import Node
+from converters.graph.ops import barracuda
+from converters.graph.ops.base import Attr, Lower, OnnxBuilder, OpDef, chain, plain, same_as
+from converters.graph.ops.elementwise import T, smooth, unary, wide
+from converters.graph.ops.litert import elementwise as litert
+from converters.graph.ops.litert.base import builtin
+from converters.graph.ops.loops import elementwise as loops
+from converters.graph.ops.loops.base import elementwise, simple
+from converters.graph.ops.older import leaky_relu
+
+
+def _sigmoid(x: np.ndarray) -> np.ndarray:
+    small = np.exp(-np.abs(x))
+    return np.asarray(np.where(x >= 0, 1.0, small) / (1 + small))
+
+
+def _elu(x: np.ndarray) -> np.ndarray:
+    return np.where(x > 0, x, np.expm1(np.minimum(x, 0.0)))
+
+
+def _selu(x: np.ndarray) -> np.ndarray:
+    alpha, scale = 1.6732632423543772, 1.0507009873554805
+    return np.asarray(scale * np.where(x > 0, x, alpha * np.expm1(np.minimum(x, 0))))
+
+
+def _clamp(name: str, function: Callable[..., np.ndarray], lower: str | Lower, **traits: Any) -> OpDef:
+    return unary(name, plain(function), lower, precision="exact", tfjs_fuses=True, **traits)
+
+
+def _leaky_relu(node: Node, x: np.ndarray) -> np.ndarray:
+    return np.where(x > 0, x, x * x.dtype.type(node.attrs["alpha"]))
+
+
+OPS = (
+    smooth(
+        "Sigmoid",
+        _sigmoid,
+        activation="sigmoid",
+        finite="always",
+        tfjs_fuses=True,
+        loops=elementwise(loops.sigmoid),
+        litert=builtin("LOGISTIC"),
+    ),
+    smooth("Tanh", np.tanh, activation="tanh", finite="always", loops=simple("tanh"), litert=builtin("TANH")),
+    _clamp(
+        "Relu",
+        lambda x: np.maximum(x, x.dtype.type(0)),
+        "Relu",
+        activation="relu",
+        loops=elementwise(loops.relu),
+        litert=litert.activation("RELU"),
+    ),
+    _clamp(
+        "Relu6",
+        lambda x: np.clip(x, x.dtype.type(0), x.dtype.type(6)),
+        chain(("Max", 0.0), ("Min", 6.0)),
+        activation="relu 6",
+        loops=elementwise(loops.relu6),
+        litert=litert.activation("RELU6"),
+    ),
+    smooth("Elu", _elu, activation="elu", tfjs_fuses=True, loops=elementwise(loops.elu), litert=builtin("ELU")),
+    smooth("Selu", _selu, activation="selu", loops=elementwise(loops.selu), litert=litert.selu),
+    smooth(
+        "Softplus",
+        lambda x: np.maximum(x, 0) + np.log1p(np.exp(-np.abs(x))),
+        activation="softplus",
+        barracuda=barracuda.SOFTPLUS,
+        loops=elementwise(loops.softplus),
+        litert=litert.softplus,
+    ),
+    unary(
+        "Softsign",
+        wide(lambda x: x / (1 + np.abs(x))),
+        "Softsign",
+        tfjs=barracuda.SOFTSIGN.write,  # TensorFlow.js 4.22 has none
+        activation="softsign",
+        barracuda=barracuda.SOFTSIGN,
+        loops=elementwise(loops.softsign),
+        litert=litert.softsign,
+    ),
+    OpDef(
+        "LeakyRelu",
+        same_as(0),
+        _leaky_relu,
+        attrs=(T, Attr("alpha", "float", 0.20000000298023224)),
+        older=leaky_relu,
+        activation="leaky relu",
+        elementwise=True,
+    ),
+)
+
+#: What a fused op has beside the attributes of the plain one.
+FUSED = (Attr("num_args", "int", 1), Attr("fused_ops", "str"), Attr("epsilon", "float", 0.0001))
+
+
+def apply_activations(node: Node, x: np.ndarray) -> np.ndarray:
+    """A product and its bias, then the activations that the fused op carries."""
+    for name in node.attrs["fused_ops"][1:]:
+        kernel = next(op.kernel for op in OPS if op.name == name)
+        assert kernel is not None
+        x = np.asarray(kernel(Node(name, name), x))
+    return x
+
+
+def lower_activated(node: Node, value: str, builder: OnnxBuilder) -> str:
+    """``apply_activations`` in ONNX, which calls the activations as TensorFlow does but has no Relu6."""
+    for name in node.attrs.get("fused_ops", ())[1:]:
+        if name == "Relu6":
+            low, high = (builder.const(np.array(bound, np.float32), "bound") for bound in (0, 6))
+            value = builder.emit("Min", [builder.emit("Max", [value, low]), high])
+        else:
+            value = builder.emit(name, [value])
+    return value
