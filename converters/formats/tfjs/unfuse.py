@@ -16,12 +16,8 @@ _PLAIN = {
     **{op.fused: op.name for op in TABLE.values() if op.fused},
     "FusedDepthwiseConv2dNative": "DepthwiseConv2dNative",
 }
-#: Activation as ``fused_ops`` names it → the op that computes it ("": a function of ``graph/nn``).
-_ACTIVATIONS = {
-    **{name: name for name in ("Relu", "Relu6", "Elu", "Sigmoid", "Tanh")},
-    "LeakyRelu": "",
-    "Prelu": "",
-}
+#: What ``fused_ops`` may name: the ops that are activations, and one that is not in the table.
+_ACTIVATIONS = frozenset(("Prelu", *(op.name for op in TABLE.values() if op.activation and op.elementwise)))
 _OWN = frozenset(("fused_ops", "num_args", "epsilon", "leakyrelu_alpha"))
 
 
