@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from converters.formats.barracuda.format import NnModel
-from converters.formats.barracuda.vocabulary import Activation, LayerType
+from converters.graph.ops.barracuda.vocabulary import Activation, LayerType
 
 #: Layers that Barracuda 1.0 has and no later version computes otherwise.
 SAFE = {

@@ -111,6 +111,12 @@ def test_an_op_computes_the_same_as_layers_or_is_refused_by_name(op: str) -> Non
     assert tuple(refused) == REFUSALS.get(op, ())
 
 
+def test_a_layer_that_is_an_op_is_no_other() -> None:
+    """Readers make the op of it; both kinds of numbers are counted from 0."""
+    kinds = [(type(op.nn.kind), op.nn.kind) for op in TABLE.values() if op.nn is not None and op.nn.kind is not None]
+    assert len(set(kinds)) == len(kinds) > 15
+
+
 # ------------------------------------------------------------------ the layers that are read
 
 

@@ -10,7 +10,7 @@ import pytest
 from converters.compiler.compile import compile_graph
 from converters.formats.barracuda.format import Trailer, parse
 from converters.formats.barracuda.graph import to_graph
-from converters.formats.barracuda.vocabulary import LayerType, layer_label
+from converters.graph.ops.barracuda.vocabulary import LayerType, layer_label
 from signatures.errors import DamagedFileError, ExportModelError, GraphError, UnsupportedOpError
 from tests.barracuda.nn_files import Maker, write_nn
 

@@ -10,7 +10,7 @@ import pytest
 
 from converters.consumers.profiles import profile
 from converters.formats.barracuda.format import parse
-from converters.formats.barracuda.vocabulary import LayerType
+from converters.graph.ops.barracuda.vocabulary import LayerType
 from signatures.roles import Role
 from tests.barracuda.conftest import params
 from tests.corpus.conftest import genuine_cases

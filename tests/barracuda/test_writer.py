@@ -18,10 +18,10 @@ from msgspec.structs import replace
 from converters.compiler.options import CompileOptions
 from converters.consumers.named_files import artifact_of
 from converters.formats.barracuda.format import NnModel, parse
-from converters.formats.barracuda.vocabulary import LayerType
 from converters.formats.format import WriteOptions
 from converters.formats.registry import WRITTEN
 from converters.graph.nodes import Graph, Node, TensorShape
+from converters.graph.ops.barracuda.vocabulary import LayerType
 from converters.graph.run import run_graph
 from converters.graph.types import FLOAT32
 from converters.policy.policy import Policy

@@ -13,9 +13,9 @@ import pytest
 from converters.compiler import compile
 from converters.files import tensorflow_messages as schema
 from converters.formats.barracuda import format as nn
-from converters.formats.barracuda import lower_base
 from converters.formats.frozen_graph.reader import read_graph
 from converters.formats.saved_model import signature
+from converters.graph.ops.barracuda import builder
 from exporter.export.sources import read_source
 from signatures.errors import MAX_LINE, DamagedFileError, GraphError, NotAPolicyError, UnsupportedOpError
 from tests.barracuda.nn_files import write_nn
@@ -231,7 +231,7 @@ def test_a_nn_of_more_joined_tensors_than_any_policy_has_is_refused(
     nodes = [*continuous_policy()[:-1], constant("axis", 1), join, node("action", "Tanh", "join", T=np.float32)]
     (policy,) = read_source(zoo.frozen(tmp_path, nodes)).policies()
     assert nn_model(policy)
-    monkeypatch.setattr(lower_base, "MAX_PIECES", MANY - 1)
+    monkeypatch.setattr(builder, "MAX_PIECES", MANY - 1)
     with pytest.raises(UnsupportedOpError, match=f"{MANY} tensors are joined"):
         nn_model(policy)
 

@@ -21,12 +21,12 @@ from converters.consumers.unity.checker import UnityVerdict, check_file
 from converters.consumers.unity.consumers import Engine, consumer
 from converters.consumers.unity.settings import Brain, sensors_of
 from converters.formats.barracuda.format import NnModel, parse
-from converters.formats.barracuda.vocabulary import LayerType
 from converters.formats.format import WriteOptions
 from converters.formats.onnx import messages
 from converters.formats.onnx.edit import lift_draws
 from converters.formats.registry import format_for_writing
 from converters.formats.source import ReadOptions
+from converters.graph.ops.barracuda.vocabulary import LayerType
 from converters.graph.run import run_graph
 from converters.policy.policy import Policy
 from exporter.export.sources import read_source

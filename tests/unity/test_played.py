@@ -21,8 +21,8 @@ from converters.consumers.unity.checker import check_file
 from converters.consumers.unity.consumers import CONSUMERS, EARLIER
 from converters.consumers.unity.settings import Brain
 from converters.formats.barracuda.format import NnModel, parse
-from converters.formats.barracuda.vocabulary import LayerType
 from converters.formats.source import ReadOptions
+from converters.graph.ops.barracuda.vocabulary import LayerType
 from exporter import export_model
 from exporter.export.sources import read_source
 from signatures.errors import ProfileError, SignatureError, UnsupportedOpError

@@ -7,7 +7,7 @@ from typing import Any
 
 from converters.consumers.unity.onnx_file import OnnxFile, attributes
 from converters.formats.barracuda.format import NnModel
-from converters.formats.barracuda.vocabulary import LayerType
+from converters.graph.ops.barracuda.vocabulary import LayerType
 
 _SWAPPED = (0, 2, 1)
 _VIEWS = frozenset({"Reshape", "Flatten"})

@@ -5,11 +5,24 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from converters.formats.barracuda.layer_builder import LayerBuilder, Value
-from converters.formats.barracuda.vocabulary import ONE_OP, Activation, activation_label
 from converters.graph.builder import Builder
 from converters.graph.nn import activations as nn
 from converters.graph.nn import reduction, trigonometry
+from converters.graph.ops.barracuda.vocabulary import Activation, activation_label
+from converters.graph.ops.table import TABLE
 
+#: Activations that are one op: those that its entry is written as, and those that Barracuda lacks before 1.4 or rounds
+#: another way, which are read alone.
+_ONE_OP: Mapping[int, str] = {
+    **{e.nn.kind: op for op, e in TABLE.items() if e.nn is not None and isinstance(e.nn.kind, Activation)},
+    Activation.SOFTPLUS: "Softplus",
+    Activation.SOFTSIGN: "Softsign",
+    Activation.ROUND: "Round",
+    Activation.COS: "Cos",
+    Activation.SIN: "Sin",
+    Activation.TAN: "Tan",
+    Activation.ERF: "Erf",
+}
 _FUNCTIONS: Mapping[int, Callable[[Builder, str], str]] = {
     Activation.SWISH: nn.swish,
     Activation.ACOS: trigonometry.acos,
@@ -48,10 +61,10 @@ def activate(b: LayerBuilder, number: int, x: Value, *, axis: int = -1, fused: b
         )
     if number in _ROWS:
         return _over_rows(b, Activation(number), x, axis)
-    if number in ONE_OP:
-        return Value(b.add(ONE_OP[number], [x.reference]), x.shape)
     if number == Activation.ELU:
         return Value(nn.elu(b, x.reference, 1.0 if fused else b.layer.alpha), x.shape)
+    if number in _ONE_OP:
+        return Value(b.add(_ONE_OP[number], [x.reference]), x.shape)
     if number in _FUNCTIONS:
         return Value(_FUNCTIONS[number](b, x.reference), x.shape)
     if number in _PARAMETRIC:

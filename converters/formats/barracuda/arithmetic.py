@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 
 from converters.formats.barracuda.layer_builder import LayerBuilder, Shape, Value, with_length
 from converters.formats.barracuda.shaping import axis_of
-from converters.formats.barracuda.vocabulary import COMPARISONS, C, LayerType, N
 from converters.graph.nn import reduction
+from converters.graph.ops.barracuda.vocabulary import C, LayerType, N
+from converters.graph.ops.table import TABLE
 from converters.graph.types import FLOAT32
 
 _FOLDED: Mapping[LayerType, str] = {
@@ -19,6 +20,10 @@ _FOLDED: Mapping[LayerType, str] = {
     LayerType.MIN: "Minimum",
     LayerType.MAX: "Maximum",
     LayerType.MEAN: "Add",
+}
+#: Comparisons, whose results are 1 and 0, and their ops.
+_COMPARISONS: Mapping[int, str] = {
+    e.nn.kind: op for op, e in TABLE.items() if e.nn is not None and isinstance(e.nn.kind, LayerType)
 }
 _REDUCED: Mapping[int, reduction.Reduction] = {
     LayerType.REDUCE_MAX: reduction.of_kind("Max"),
@@ -48,7 +53,7 @@ def fold_inputs(b: LayerBuilder, args: Sequence[Value]) -> Value:
 def compare_operands(b: LayerBuilder, args: Sequence[Value]) -> Value:
     """1 where the comparison holds, else 0."""
     operands, shape = b.operands(args)
-    return _as_float(b, b.add(COMPARISONS[b.layer.type], operands), shape)
+    return _as_float(b, b.add(_COMPARISONS[b.layer.type], operands), shape)
 
 
 def logical(b: LayerBuilder, args: Sequence[Value]) -> Value:

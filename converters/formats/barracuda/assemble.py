@@ -8,8 +8,8 @@ import numpy as np
 from msgspec.structs import replace
 
 from converters.formats.barracuda.format import Dataset, Layer, NnInput, NnMemory, NnModel
-from converters.formats.barracuda.lower_base import Draft, NnBuilder
-from converters.formats.barracuda.vocabulary import Activation, LayerType
+from converters.graph.ops.barracuda.builder import Draft, NnBuilder
+from converters.graph.ops.barracuda.vocabulary import Activation, LayerType
 from signatures.errors import UnsupportedOpError
 
 #: Every Barracuda from 1.0 to 3.0 reads it, and none of the later ones is read by all.

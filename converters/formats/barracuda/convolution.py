@@ -13,9 +13,9 @@ from msgspec.structs import replace
 
 from converters.formats.barracuda.dense import add_bias
 from converters.formats.barracuda.layer_builder import LayerBuilder, Value
-from converters.formats.barracuda.vocabulary import LayerType
 from converters.graph.nn import convolution as nn
 from converters.graph.nn import normalisation, pooling
+from converters.graph.ops.barracuda.vocabulary import LayerType
 
 _SAME, _SAME_LOWER = -1, -2
 #: What Unity's maximum starts from; a border of it never wins.

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from converters.formats.barracuda.layer_builder import LayerBuilder, Shape, Value
-from converters.formats.barracuda.vocabulary import LayerType
 from converters.graph.nn import linear
 from converters.graph.nn.activations import scale_and_shift
+from converters.graph.ops.barracuda.vocabulary import LayerType
 from converters.graph.types import FLOAT32, INT32, INT64
 
 

@@ -37,6 +37,9 @@ _MAX_AXES = 8
 _INT, _LONG = struct.Struct("<i"), struct.Struct("<q")
 MAX_LAYERS = 1 << 14
 
+#: The ``version_number`` from which on classes are drawn in the model and memories are inputs and outputs.
+_DRAWS_IN_MODEL = 3
+
 Ints = tuple[int, ...]
 _Item = TypeVar("_Item")
 
@@ -129,6 +132,11 @@ class NnModel(Struct, frozen=True, eq=False):
         """A dataset's numbers as [N, H, W, C]. Raises DamagedFileError for a shape of more axes."""
         values = self.weights[dataset.offset : dataset.offset + dataset.length]
         return values.reshape(four_axes(dataset.shape, f"dataset {dataset.name!r}"))
+
+
+def draws_in_model(version: float) -> bool:
+    """Whether a model of this API version of ML-Agents draws classes by itself and has its memory as an input."""
+    return version >= _DRAWS_IN_MODEL
 
 
 def four_axes(shape: Ints, where: str) -> tuple[int, int, int, int]:

@@ -15,12 +15,12 @@ from functools import partial
 from msgspec import Struct
 from msgspec.structs import replace
 
-from converters.formats.barracuda.format import EIGHT_AXES, Layer, NnInput, NnModel, four_axes
+from converters.formats.barracuda.format import EIGHT_AXES, Layer, NnInput, NnModel, draws_in_model, four_axes
 from converters.formats.barracuda.layer_builder import MAX_ELEMENTS, LayerBuilder, Value, node_name
 from converters.formats.barracuda.layers import check_bypassed, translate
 from converters.formats.barracuda.slices import upstream
-from converters.formats.barracuda.vocabulary import LayerType, draws_in_model
 from converters.graph.nodes import Graph, NameScope, joined_name
+from converters.graph.ops.barracuda.vocabulary import LayerType
 from converters.graph.types import FLOAT32, INT32, INT64
 from signatures.errors import DamagedFileError, ExportModelError, SignatureError
 from signatures.roles import ACTION_NAMES, ACTION_SHAPE, OUTPUT_NAMES, VERSION_NUMBER, Role

@@ -15,9 +15,9 @@ import numpy.typing as npt
 from msgspec import Struct
 
 from converters.formats.barracuda.format import Layer, four_axes
-from converters.formats.barracuda.vocabulary import layer_label
 from converters.graph.builder import Builder
 from converters.graph.nodes import NameScope, Node
+from converters.graph.ops.barracuda.vocabulary import layer_label
 from signatures.errors import GraphError, UnsupportedOpError
 
 #: N, H, W, C; N is None where it is the batch.

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from converters.formats.barracuda import activations, arithmetic, convolution, dense, shaping
 from converters.formats.barracuda.format import Layer
 from converters.formats.barracuda.layer_builder import LayerBuilder, Value
-from converters.formats.barracuda.vocabulary import Activation, LayerType, layer_label
+from converters.graph.ops.barracuda.vocabulary import Activation, LayerType, layer_label
 from signatures.errors import DamagedFileError, UnsupportedOpError
 
 #: Takes (builder, the layer's inputs and then its datasets).

@@ -10,13 +10,13 @@ from __future__ import annotations
 
 from converters.compiler.targets import BARRACUDA, prepare
 from converters.formats.barracuda.assemble import assemble
-from converters.formats.barracuda.format import NnInput, NnMemory, NnModel
-from converters.formats.barracuda.lower_arrays import as_row
-from converters.formats.barracuda.lower_base import NnBuilder
-from converters.formats.barracuda.lower_table import lower_graph
-from converters.formats.barracuda.lower_values import FREE, Axes, Value, usual_axes
-from converters.formats.barracuda.vocabulary import C, H, LayerType, N, W, draws_in_model
+from converters.formats.barracuda.format import NnInput, NnMemory, NnModel, draws_in_model
+from converters.formats.barracuda.lower_graph import lower_graph
 from converters.graph.nodes import Node, node_of
+from converters.graph.ops.barracuda.arrays import as_row
+from converters.graph.ops.barracuda.builder import NnBuilder
+from converters.graph.ops.barracuda.values import FREE, Axes, Value, usual_axes
+from converters.graph.ops.barracuda.vocabulary import C, H, LayerType, N, W
 from converters.graph.shapes import infer_types
 from converters.graph.types import BATCH, Dim
 from converters.policy.policy import Policy

@@ -12,10 +12,12 @@ import numpy as np
 
 from converters.formats.barracuda.format import EIGHT_AXES
 from converters.formats.barracuda.layer_builder import LayerBuilder, Shape, Value, with_length
-from converters.formats.barracuda.vocabulary import EIGHT, C, H, N, W
+from converters.graph.ops.barracuda.vocabulary import C, H, N, W
 from converters.graph.types import INT32
 
 _NAMES = "NHWC"
+#: Positions of N, H, W, C in the eight-entry shapes of versions from 17 on: S, R, N, T, D, H, W, C.
+_EIGHT = (2, 5, 6, 7)
 #: Ends of a slice that mean "to the end" wherever it is.
 _FAR = (1 << 31) - 1
 
@@ -26,8 +28,8 @@ def axis_of(b: LayerBuilder, axis: int) -> int:
         return axis + 4
     if b.version < EIGHT_AXES and 0 <= axis < 4:
         return axis
-    if b.version >= EIGHT_AXES and axis in EIGHT:
-        return EIGHT.index(axis)
+    if b.version >= EIGHT_AXES and axis in _EIGHT:
+        return _EIGHT.index(axis)
     raise b.unsupported_error(f"the axis is {axis}", "the tensors of a policy have the axes N, H, W and C")
 
 
@@ -100,7 +102,7 @@ def transpose(b: LayerBuilder, args: Sequence[Value]) -> Value:
             raise b.unsupported_error(
                 f"the order is {list(order)}", "the tensors of a policy have the axes N, H, W and C"
             )
-        order = tuple(EIGHT.index(order[i]) for i in EIGHT)
+        order = tuple(_EIGHT.index(order[i]) for i in _EIGHT)
     if sorted(order) != [0, 1, 2, 3]:
         raise b.unsupported_error(f"the order is {list(order)}", "only the four axes N, H, W, C can be put in order")
     n, h, w, c = (x.shape[i] for i in order)
@@ -163,7 +165,7 @@ def _strided_slice(b: LayerBuilder, x: str, cuts: Sequence[tuple[int, int, int]]
 
 def _entries(b: LayerBuilder, values: Sequence[int], default: int) -> list[int]:
     if len(values) == 8 and all(values[i] in (0, 1, default) for i in (0, 1, 3, 4)):
-        return [values[i] for i in EIGHT]
+        return [values[i] for i in _EIGHT]
     if len(values) != 4:
         raise b.damaged_error(f"the bounds are {list(values)}", "they have four entries, or eight")
     return list(values)

@@ -14,8 +14,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from msgspec.structs import replace
 
 from converters.formats.barracuda.format import Layer, NnModel
-from converters.formats.barracuda.vocabulary import Activation, LayerType
 from converters.graph.nodes import reachable
+from converters.graph.ops.barracuda.vocabulary import Activation, LayerType
 from signatures.roles import ACTION_SHAPE
 
 _MASKS = "action_masks"

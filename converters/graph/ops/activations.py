@@ -8,7 +8,10 @@ from typing import Any
 import numpy as np
 
 from converters.graph.nodes import Node
-from converters.graph.ops import barracuda
+from converters.graph.ops.barracuda import decompositions
+from converters.graph.ops.barracuda import elementwise as nn
+from converters.graph.ops.barracuda.base import Nn
+from converters.graph.ops.barracuda.vocabulary import Activation
 from converters.graph.ops.base import Attr, Lower, OnnxBuilder, OpDef, chain, plain, same_as
 from converters.graph.ops.elementwise import T, smooth, unary, wide
 from converters.graph.ops.litert import elementwise as litert
@@ -27,8 +30,12 @@ def _elu(x: np.ndarray) -> np.ndarray:
     return np.where(x > 0, x, np.expm1(np.minimum(x, 0.0)))
 
 
+#: The slope below 0 and the scale, for which a network keeps its activations normal.
+_SELU = 1.6732632423543772, 1.0507009873554805
+
+
 def _selu(x: np.ndarray) -> np.ndarray:
-    alpha, scale = 1.6732632423543772, 1.0507009873554805
+    alpha, scale = _SELU
     return np.asarray(scale * np.where(x > 0, x, alpha * np.expm1(np.minimum(x, 0))))
 
 
@@ -47,15 +54,25 @@ OPS = (
         activation="sigmoid",
         finite="always",
         tfjs_fuses=True,
+        nn=nn.activation(Activation.SIGMOID),
         loops=elementwise(loops.sigmoid),
         litert=builtin("LOGISTIC"),
     ),
-    smooth("Tanh", np.tanh, activation="tanh", finite="always", loops=simple("tanh"), litert=builtin("TANH")),
+    smooth(
+        "Tanh",
+        np.tanh,
+        activation="tanh",
+        finite="always",
+        nn=nn.activation(Activation.TANH),
+        loops=simple("tanh"),
+        litert=builtin("TANH"),
+    ),
     _clamp(
         "Relu",
         lambda x: np.maximum(x, x.dtype.type(0)),
         "Relu",
         activation="relu",
+        nn=nn.activation(Activation.RELU),
         loops=elementwise(loops.relu),
         litert=litert.activation("RELU"),
     ),
@@ -64,16 +81,25 @@ OPS = (
         lambda x: np.clip(x, x.dtype.type(0), x.dtype.type(6)),
         chain(("Max", 0.0), ("Min", 6.0)),
         activation="relu 6",
+        nn=nn.activation(Activation.RELU6),
         loops=elementwise(loops.relu6),
         litert=litert.activation("RELU6"),
     ),
-    smooth("Elu", _elu, activation="elu", tfjs_fuses=True, loops=elementwise(loops.elu), litert=builtin("ELU")),
-    smooth("Selu", _selu, activation="selu", loops=elementwise(loops.selu), litert=litert.selu),
+    smooth(
+        "Elu",
+        _elu,
+        activation="elu",
+        tfjs_fuses=True,
+        nn=nn.activation(Activation.ELU),
+        loops=elementwise(loops.elu),
+        litert=builtin("ELU"),
+    ),
+    smooth("Selu", _selu, activation="selu", nn=nn.selu(*_SELU), loops=elementwise(loops.selu), litert=litert.selu),
     smooth(
         "Softplus",
         lambda x: np.maximum(x, 0) + np.log1p(np.exp(-np.abs(x))),
         activation="softplus",
-        barracuda=barracuda.SOFTPLUS,
+        barracuda=decompositions.SOFTPLUS,
         loops=elementwise(loops.softplus),
         litert=litert.softplus,
     ),
@@ -81,9 +107,9 @@ OPS = (
         "Softsign",
         wide(lambda x: x / (1 + np.abs(x))),
         "Softsign",
-        tfjs=barracuda.SOFTSIGN.write,  # TensorFlow.js 4.22 has none
+        tfjs=decompositions.SOFTSIGN.write,  # TensorFlow.js 4.22 has none
         activation="softsign",
-        barracuda=barracuda.SOFTSIGN,
+        barracuda=decompositions.SOFTSIGN,
         loops=elementwise(loops.softsign),
         litert=litert.softsign,
     ),
@@ -93,11 +119,15 @@ OPS = (
         _leaky_relu,
         attrs=(T, Attr("alpha", "float", 0.20000000298023224)),
         older=leaky_relu,
+        nn=Nn(nn.leaky_relu),
         activation="leaky relu",
         elementwise=True,
     ),
 )
 
+_BY_NAME = {op.name: op for op in OPS}
+#: Activation → what it is in a ``.nn``, of those that every Barracuda has.
+NN_KINDS = {op.name: op.nn.kind for op in OPS if op.nn is not None and isinstance(op.nn.kind, Activation)}
 #: What a fused op has beside the attributes of the plain one.
 FUSED = (Attr("num_args", "int", 1), Attr("fused_ops", "str"), Attr("epsilon", "float", 0.0001))
 
@@ -105,7 +135,7 @@ FUSED = (Attr("num_args", "int", 1), Attr("fused_ops", "str"), Attr("epsilon", "
 def apply_activations(node: Node, x: np.ndarray) -> np.ndarray:
     """A product and its bias, then the activations that the fused op carries."""
     for name in node.attrs["fused_ops"][1:]:
-        kernel = next(op.kernel for op in OPS if op.name == name)
+        kernel = _BY_NAME[name].kernel
         assert kernel is not None
         x = np.asarray(kernel(Node(name, name), x))
     return x

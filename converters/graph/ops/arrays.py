@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 
 from converters.graph.nodes import Node, TensorShape
+from converters.graph.ops.barracuda import arrays as nn
+from converters.graph.ops.barracuda.base import Nn
 from converters.graph.ops.base import (
     Attr,
     OnnxBuilder,
@@ -249,6 +251,7 @@ OPS = (
             lambda node, x: x,
             lambda node, builder: builder.value(node.inputs[0]),
             (T, Attr("message", "str", "")) if name in ("PreventGradient", "CheckNumerics") else (T,),
+            nn=Nn(nn.same),
             litert=same,
             loops=view,
             moves="same",
@@ -277,6 +280,7 @@ OPS = (
         lambda node, x, shape: x.reshape([int(d) for d in shape.reshape(-1)]),
         direct("Reshape", shape_at=1),
         (T, type_attr("Tshape", "in:1")),
+        nn=Nn(nn.reshape),
         litert=litert.reshape,
         loops=view,
         moves="view",
@@ -287,6 +291,7 @@ OPS = (
         _squeeze,
         _lower_squeeze,
         (T, Attr("squeeze_dims", "int", ())),
+        nn=Nn(nn.reshape),
         litert=_litert_squeeze,
         loops=view,
         moves="view",
@@ -297,6 +302,7 @@ OPS = (
         lambda node, x, axis: np.expand_dims(x, int(axis.reshape(()))),
         _lower_expand_dims,
         (T, type_attr("Tdim", "in:1")),
+        nn=Nn(nn.reshape),
         litert=litert.expand_dims,
         loops=view,
         moves="view",
@@ -307,6 +313,7 @@ OPS = (
         _transpose,
         _lower_transpose,
         (T, type_attr("Tperm", "in:1")),
+        nn=Nn(nn.transpose),
         litert=litert.transpose,
         loops=transpose,
         moves="turn",

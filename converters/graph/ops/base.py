@@ -14,6 +14,7 @@ import numpy as np
 from msgspec import Struct
 
 from converters.graph.nodes import Node
+from converters.graph.ops.barracuda.base import Nn
 from converters.graph.ops.litert.base import Litert
 from converters.graph.ops.loops.base import Loops
 from converters.graph.ops.rewriting import Decomposition, Older, Shape, Tfjs
@@ -113,6 +114,8 @@ class OpDef(_Entry, frozen=True, kw_only=True):
     tfjs: Tfjs | None = None
     #: Where a Barracuda lacks it, or computes it otherwise.
     barracuda: Decomposition | None = None
+    #: Which layers of a Barracuda ``.nn`` it becomes; None: none that every Barracuda has compute it.
+    nn: Nn | None = None
     #: How it is written in LiteRT's operators; None: LiteRT has none that compute it.
     litert: Litert | None = None
     #: How each element is computed: what source code is printed from; None: it is not printed.

@@ -9,7 +9,11 @@ import numpy as np
 from msgspec.structs import replace
 
 from converters.graph.nodes import Node
-from converters.graph.ops.activations import FUSED, apply_activations, lower_activated
+from converters.graph.ops.activations import FUSED, NN_KINDS, apply_activations, lower_activated
+from converters.graph.ops.barracuda import arrays as nn_arrays
+from converters.graph.ops.barracuda import layers as nn
+from converters.graph.ops.barracuda.base import FIRST, Nn
+from converters.graph.ops.barracuda.vocabulary import LayerType
 from converters.graph.ops.base import (
     REQUIRED,
     Attr,
@@ -244,12 +248,20 @@ OPS = (
         _lower_conv2d,
         [_CUDNN],
         conv2d,
+        nn=Nn(nn.conv2d),
         loops=loops.convolution,
         tfjs=_tfjs_convolution,
         fused="_FusedConv2D",
     ),
     _convolution(
-        "_FusedConv2D", _fused_conv2d, _lower_conv2d, [_CUDNN, *FUSED], conv2d, loops=loops.convolution, since="1.13"
+        "_FusedConv2D",
+        _fused_conv2d,
+        _lower_conv2d,
+        [_CUDNN, *FUSED],
+        conv2d,
+        nn=nn.with_activations(nn.conv2d, NN_KINDS),
+        loops=loops.convolution,
+        since="1.13",
     ),
     _convolution(
         "DepthwiseConv2dNative",
@@ -257,6 +269,7 @@ OPS = (
         _lower_depthwise,
         [],
         depthwise,
+        nn=Nn(nn.depthwise),
         loops=loops.depthwise,
         tfjs=_tfjs_convolution,
     ),
@@ -266,6 +279,7 @@ OPS = (
         _max_pool,
         _lower_pool("MaxPool"),
         _POOL,
+        nn=nn.pool(LayerType.MAX_POOL2D),
         litert=pool("MAX_POOL_2D"),
         loops=loops.pool("max"),
         precision="exact",
@@ -277,6 +291,7 @@ OPS = (
         _avg_pool,
         _lower_pool("AveragePool"),
         _POOL[:-1],
+        nn=nn.pool(LayerType.AVG_POOL2D),
         litert=pool("AVERAGE_POOL_2D"),
         loops=loops.pool("sum"),
         layer="pool",
@@ -288,6 +303,7 @@ OPS = (
             _pad,
             _lower_pad,
             (T, type_attr("Tpaddings", "in:1")),
+            nn=Nn(nn_arrays.pad, FIRST),
             litert=pad,
             loops=arrays.pad,
             precision="exact",

@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 
 from converters.graph.nodes import Node
-from converters.graph.ops import barracuda
 from converters.graph.ops.arrays import target_dims
+from converters.graph.ops.barracuda import arrays as nn
+from converters.graph.ops.barracuda import decompositions
+from converters.graph.ops.barracuda.base import FIRST, NONE, Nn
 from converters.graph.ops.base import (
     Attr,
     OnnxBuilder,
@@ -166,6 +168,7 @@ OPS = (
         _fill,
         direct("Expand", 1, 0, shape_at=0),
         (type_attr("T", "in:1"), Attr("index_type", "type", INT32, since="1.7")),
+        nn=Nn(nn.fill, NONE),
         litert=litert.fill,
         loops=loops.broadcast_operand(1),
         precision="exact",
@@ -176,6 +179,7 @@ OPS = (
         lambda node, x, dims: np.asarray(np.broadcast_to(x, [int(d) for d in dims]), order="C"),
         attrs=(T, type_attr("Tidx", "in:1")),
         older=broadcast_to,
+        nn=Nn(nn.broadcast_to),
         moves="repeat",
     ),
     OpDef(
@@ -184,6 +188,7 @@ OPS = (
         _tile,
         direct("Tile", shape_at=1),
         (T, type_attr("Tmultiples", "in:1")),
+        nn=Nn(nn.tile),
         litert=litert.tile,
         loops=loops.tile,
         moves="repeat",
@@ -204,7 +209,8 @@ OPS = (
         _lower_one_hot,
         (type_attr("T", "in:2"), type_attr("TI"), Attr("axis", "int", -1)),
         tfjs=_tfjs_one_hot,
-        barracuda=barracuda.ONE_HOT,
+        barracuda=decompositions.ONE_HOT,
+        nn=Nn(None, FIRST, why="it takes a row of indices per agent, and gives the classes on the last axis"),
         litert=litert.one_hot,
         loops=loops.one_hot,
         precision="exact",
@@ -217,11 +223,12 @@ OPS = (
         lambda node, x: np.zeros_like(x),
         _lower_zeros_like,
         (T,),
-        barracuda=barracuda.ZEROS_LIKE,
+        barracuda=decompositions.ZEROS_LIKE,
         elementwise=True,
         precision="exact",
         full_of=0,
         loops=full_of(0),
+        nn=nn.full_like(0),
         litert=full_like(0),
     ),
     OpDef(
@@ -234,6 +241,7 @@ OPS = (
         precision="exact",
         full_of=1,
         loops=full_of(1),
+        nn=nn.full_like(1),
         litert=full_like(1),
     ),
 )

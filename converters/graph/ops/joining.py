@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 
 from converters.graph.nodes import Node
-from converters.graph.ops import barracuda
+from converters.graph.ops.barracuda import arrays as nn
+from converters.graph.ops.barracuda import decompositions
+from converters.graph.ops.barracuda.base import Nn
 from converters.graph.ops.base import (
     Attr,
     OnnxBuilder,
@@ -179,6 +181,7 @@ OPS = (
         _concat,
         _lower_concat,
         (Attr("N", "int", derive="count:1"), T, type_attr("Tidx", "in:-1")),
+        nn=Nn(nn.concat),
         litert=litert.concat,
         loops=loops.concat,
         moves="join",
@@ -190,6 +193,7 @@ OPS = (
         _pack,
         _lower_pack,
         (Attr("N", "int", derive="count"), T, Attr("axis", "int", 0)),
+        nn=Nn(nn.pack),
         litert=litert.pack,
         loops=loops.pack,
         moves="join",
@@ -202,6 +206,7 @@ OPS = (
         _lower_unpack,
         (Attr("num", "int"), T, Attr("axis", "int", 0)),
         outputs=-1,
+        nn=Nn(nn.unpack),
         litert=litert.unpack,
         loops=loops.unpack,
         spellings=("Unstack",),
@@ -213,7 +218,8 @@ OPS = (
         _split,
         _lower_split,
         (Attr("num_split", "int"), type_attr("T", "in:1")),
-        barracuda=barracuda.SPLIT,
+        barracuda=decompositions.SPLIT,
+        nn=nn.split(axis_at=0),
         litert=litert.split,
         loops=loops.split,
         outputs=-1,
@@ -226,7 +232,8 @@ OPS = (
         _split_v,
         _lower_split,
         (Attr("num_split", "int"), T, type_attr("Tlen", "in:1")),
-        barracuda=barracuda.SPLIT,
+        barracuda=decompositions.SPLIT,
+        nn=nn.split(axis_at=2),
         litert=litert.split_v,
         loops=loops.split,
         outputs=-1,

@@ -8,7 +8,11 @@ from typing import Any
 import numpy as np
 
 from converters.graph.nodes import Node
-from converters.graph.ops.activations import FUSED, apply_activations, lower_activated
+from converters.graph.ops.activations import FUSED, NN_KINDS, apply_activations, lower_activated
+from converters.graph.ops.barracuda import layers as nn
+from converters.graph.ops.barracuda.base import Nn
+from converters.graph.ops.barracuda.elementwise import pair
+from converters.graph.ops.barracuda.vocabulary import LayerType
 from converters.graph.ops.base import (
     Attr,
     Kernel,
@@ -163,15 +167,32 @@ _GRADIENT = (Attr("grad_a", "bool", False, since="2.16"), Attr("grad_b", "bool",
 _ADJOINED = (Attr("adj_x", "bool", False), Attr("adj_y", "bool", False))
 
 OPS = (
-    _dense("MatMul", matmul, _lower_matmul, (*_TRANSPOSED, *_GRADIENT), fused="_FusedMatMul"),
-    _dense("BatchMatMul", matmul, _lower_matmul, _ADJOINED, spellings=("BatchMatMulV2", "BatchMatMulV3")),
-    _dense("_FusedMatMul", _fused_matmul, _lower_fused_matmul, (*_TRANSPOSED, *FUSED), since="1.15"),
+    _dense(
+        "MatMul",
+        matmul,
+        _lower_matmul,
+        (*_TRANSPOSED, *_GRADIENT),
+        nn=Nn(nn.matmul, takes_images=True),
+        fused="_FusedMatMul",
+    ),
+    _dense(
+        "BatchMatMul", matmul, _lower_matmul, _ADJOINED, nn=Nn(nn.matmul), spellings=("BatchMatMulV2", "BatchMatMulV3")
+    ),
+    _dense(
+        "_FusedMatMul",
+        _fused_matmul,
+        _lower_fused_matmul,
+        (*_TRANSPOSED, *FUSED),
+        nn=nn.with_activations(nn.matmul, NN_KINDS, takes_images=True),
+        since="1.15",
+    ),
     OpDef(
         "BiasAdd",
         _infer_bias_add,
         plain(np.add),
         direct("Add"),
         (T, Attr("data_format", "str", "NHWC")),
+        nn=pair(LayerType.ADD),
         litert=builtin("ADD"),
         loops=simple("add"),
     ),

@@ -8,7 +8,10 @@ from typing import Any
 import numpy as np
 
 from converters.graph.nodes import Node
-from converters.graph.ops import barracuda
+from converters.graph.ops.barracuda import decompositions
+from converters.graph.ops.barracuda.base import Nn
+from converters.graph.ops.barracuda.elementwise import compare, pair
+from converters.graph.ops.barracuda.vocabulary import LayerType
 from converters.graph.ops.base import (
     Attr,
     Lower,
@@ -34,7 +37,9 @@ from converters.graph.types import BOOL, Symbols, TensorType
 T = type_attr()
 
 
-def _comparison(name: str, function: Callable[..., np.ndarray], lowering: Lower, litert: Litert, loops: Loops) -> OpDef:
+def _comparison(
+    name: str, function: Callable[..., np.ndarray], lowering: Lower, nn: Nn, litert: Litert, loops: Loops
+) -> OpDef:
     attrs: tuple[Attr, ...] = (T,)
     if name in ("Equal", "NotEqual"):
         attrs = (T, Attr("incompatible_shape_error", "bool", True, since="1.15", supported=False))
@@ -45,6 +50,7 @@ def _comparison(name: str, function: Callable[..., np.ndarray], lowering: Lower,
         kernel,
         lowering,
         attrs,
+        nn=nn,
         litert=litert,
         loops=loops,
         precision="exact",
@@ -70,7 +76,7 @@ def _lower_select(node: Node, builder: OnnxBuilder) -> Any:
 
 def _tfjs_select(builder: GraphBuilder, node: Node, types: Mapping[str, TensorType]) -> Node:
     """TensorFlow.js broadcasts a vector condition over the last axis, not the first: SelectV2 of a reshaped one."""
-    condition = barracuda.whole_rows(builder, node, types)
+    condition = decompositions.whole_rows(builder, node, types)
     return Node(node.name, "SelectV2", (condition, *node.inputs[1:]), origin=node.origin)
 
 
@@ -84,25 +90,46 @@ def _infer_select_v2(node: Node, args: Sequence[TensorType], symbols: Symbols) -
     return broadcast_of()(node, [TensorType(kind, args[0].shape), *args[1:]], symbols)
 
 
+#: Decomposed where it can be.
+_NO_SELECT = Nn(None, why="it chooses an infinite number, and infinity times 0 is NaN")
+
 OPS = (
-    _comparison("Less", np.less, direct("Less"), builtin("LESS"), loops.comparison_loops("less")),
     _comparison(
-        "LessEqual", np.less_equal, direct("LessOrEqual"), builtin("LESS_EQUAL"), loops.comparison_loops("less_equal")
+        "Less", np.less, direct("Less"), compare(LayerType.LESS), builtin("LESS"), loops.comparison_loops("less")
     ),
-    _comparison("Greater", np.greater, direct("Greater"), builtin("GREATER"), elementwise(loops.greater)),
+    _comparison(
+        "LessEqual",
+        np.less_equal,
+        direct("LessOrEqual"),
+        compare(LayerType.LESS_EQUAL),
+        builtin("LESS_EQUAL"),
+        loops.comparison_loops("less_equal"),
+    ),
+    _comparison(
+        "Greater",
+        np.greater,
+        direct("Greater"),
+        compare(LayerType.GREATER),
+        builtin("GREATER"),
+        elementwise(loops.greater),
+    ),
     # The other way round: Barracuda has no GreaterOrEqual.
     _comparison(
         "GreaterEqual",
         np.greater_equal,
         direct("LessOrEqual", 1, 0),
+        compare(LayerType.GREATER_EQUAL),
         builtin("GREATER_EQUAL"),
         elementwise(loops.greater_equal),
     ),
-    _comparison("Equal", np.equal, direct("Equal"), builtin("EQUAL"), loops.comparison_loops("equal")),
+    _comparison(
+        "Equal", np.equal, direct("Equal"), compare(LayerType.EQUAL), builtin("EQUAL"), loops.comparison_loops("equal")
+    ),
     _comparison(
         "NotEqual",
         np.not_equal,
         chain(("Equal", None), ("Not", None)),
+        compare(LayerType.EQUAL, negated=True),
         builtin("NOT_EQUAL"),
         elementwise(loops.not_equal),
     ),
@@ -112,19 +139,23 @@ OPS = (
             broadcast_of(BOOL, count=2),
             plain(function),
             direct(onnx),
+            nn=pair(layer),
             litert=builtin(f"LOGICAL_{onnx.upper()}"),
             loops=loops.comparison_loops(onnx.lower()),
             precision="exact",
             elementwise=True,
         )
-        for name, function, onnx in (("LogicalAnd", np.logical_and, "And"), ("LogicalOr", np.logical_or, "Or"))
+        for name, function, onnx, layer in (
+            ("LogicalAnd", np.logical_and, "And", LayerType.MUL),
+            ("LogicalOr", np.logical_or, "Or", LayerType.MAX),
+        )
     ),
     OpDef(
         "LogicalNot",
         same_as(0, count=1),
         plain(np.logical_not),
         direct("Not"),
-        barracuda=barracuda.LOGICAL_NOT,
+        barracuda=decompositions.LOGICAL_NOT,
         litert=builtin("LOGICAL_NOT"),
         loops=simple("not"),
         precision="exact",
@@ -137,7 +168,8 @@ OPS = (
         _lower_select,
         (type_attr("T", "in:1"),),
         tfjs=_tfjs_select,
-        barracuda=barracuda.SELECT,
+        barracuda=decompositions.SELECT,
+        nn=_NO_SELECT,
         litert=select,
         loops=loops.select,
         precision="exact",
@@ -147,7 +179,8 @@ OPS = (
         _infer_select_v2,
         lambda node, c, a, b: np.where(c, a, b),
         attrs=(type_attr("T", "in:1"),),
-        barracuda=barracuda.SELECT,
+        barracuda=decompositions.SELECT,
+        nn=_NO_SELECT,
         older=select_v2,
         since="1.14",
         precision="exact",

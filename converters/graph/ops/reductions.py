@@ -9,6 +9,8 @@ from typing import Any, Literal
 import numpy as np
 
 from converters.graph.nodes import Node
+from converters.graph.ops.barracuda import layers as nn
+from converters.graph.ops.barracuda.vocabulary import Activation, LayerType
 from converters.graph.ops.base import (
     Attr,
     OnnxBuilder,
@@ -93,14 +95,20 @@ def _litert_reduction(op: str) -> Callable[[Node, LitertBuilder], Any]:
 
 
 def _reduce(
-    name: str, function: Callable[..., Any], onnx_op: str, precision: Precision, litert_op: str, **traits: Any
+    name: str,
+    function: Callable[..., Any],
+    onnx_op: str,
+    precision: Precision,
+    litert_op: str,
+    layer: LayerType,
+    **traits: Any,
 ) -> OpDef:
     attrs: tuple[Attr, ...] = (Attr("keep_dims", "bool", False), type_attr("Tidx", "in:1"))
     if name not in ("All", "Any"):
         attrs = (T, *attrs)
     kernel = _reduction(function, wide=precision != "exact")
-    lower, litert = _lower_reduction(onnx_op), _litert_reduction(litert_op)
-    return OpDef(name, _infer_reduction, kernel, lower, attrs, litert=litert, precision=precision, **traits)
+    lower, litert, layers = _lower_reduction(onnx_op), _litert_reduction(litert_op), nn.reduction(layer)
+    return OpDef(name, _infer_reduction, kernel, lower, attrs, nn=layers, litert=litert, precision=precision, **traits)
 
 
 def _arg(function: Callable[..., Any]) -> Callable[..., np.ndarray]:
@@ -137,9 +145,9 @@ def _litert_arg(op: str) -> Callable[[Node, LitertBuilder], Any]:
 
 
 _ARG_ATTRS = (T, type_attr("Tidx", "in:1"), Attr("output_type", "type", INT64))
-_CHOICES: tuple[tuple[str, Callable[..., Any], str, Literal["largest", "smallest"]], ...] = (
-    ("ArgMax", np.argmax, "ARG_MAX", "largest"),
-    ("ArgMin", np.argmin, "ARG_MIN", "smallest"),
+_CHOICES: tuple[tuple[str, Callable[..., Any], str, Literal["largest", "smallest"], LayerType], ...] = (
+    ("ArgMax", np.argmax, "ARG_MAX", "largest", LayerType.REDUCE_MAX),
+    ("ArgMin", np.argmin, "ARG_MIN", "smallest", LayerType.REDUCE_MIN),
 )
 
 
@@ -218,13 +226,33 @@ def _log_softmax(node: Node, x: np.ndarray) -> np.ndarray:
 
 
 OPS = (
-    _reduce("Sum", np.sum, "ReduceSum", "summed", "SUM", loops=loops.reduction("sum")),
-    _reduce("Mean", _mean, "ReduceMean", "rounded", "MEAN", takes="mean", loops=loops.reduction("sum", mean=True)),
-    _reduce("Prod", np.prod, "ReduceProd", "rounded", "REDUCE_PROD", loops=loops.reduction("product")),
-    _reduce("Max", np.max, "ReduceMax", "exact", "REDUCE_MAX", takes="largest", loops=loops.reduction("max")),
-    _reduce("Min", np.min, "ReduceMin", "exact", "REDUCE_MIN", loops=loops.reduction("min")),
-    _reduce("All", np.all, "ReduceMin", "exact", "REDUCE_ALL", loops=loops.truth("min")),
-    _reduce("Any", np.any, "ReduceMax", "exact", "REDUCE_ANY", loops=loops.truth("max")),
+    _reduce("Sum", np.sum, "ReduceSum", "summed", "SUM", LayerType.REDUCE_SUM, loops=loops.reduction("sum")),
+    _reduce(
+        "Mean",
+        _mean,
+        "ReduceMean",
+        "rounded",
+        "MEAN",
+        LayerType.REDUCE_MEAN,
+        takes="mean",
+        loops=loops.reduction("sum", mean=True),
+    ),
+    _reduce(
+        "Prod", np.prod, "ReduceProd", "rounded", "REDUCE_PROD", LayerType.REDUCE_PROD, loops=loops.reduction("product")
+    ),
+    _reduce(
+        "Max",
+        np.max,
+        "ReduceMax",
+        "exact",
+        "REDUCE_MAX",
+        LayerType.REDUCE_MAX,
+        takes="largest",
+        loops=loops.reduction("max"),
+    ),
+    _reduce("Min", np.min, "ReduceMin", "exact", "REDUCE_MIN", LayerType.REDUCE_MIN, loops=loops.reduction("min")),
+    _reduce("All", np.all, "ReduceMin", "exact", "REDUCE_ALL", LayerType.REDUCE_MIN, loops=loops.truth("min")),
+    _reduce("Any", np.any, "ReduceMax", "exact", "REDUCE_ANY", LayerType.REDUCE_MAX, loops=loops.truth("max")),
     *(
         OpDef(
             name,
@@ -232,12 +260,13 @@ OPS = (
             _arg(function),
             _lower_arg(name),
             _ARG_ATTRS,
+            nn=nn.arg_best(best),
             litert=_litert_arg(operator),
             loops=loops.arg("first largest" if chosen == "largest" else "first smallest"),
             precision="exact",
             chooses=chosen,
         )
-        for name, function, operator, chosen in _CHOICES
+        for name, function, operator, chosen, best in _CHOICES
     ),
     OpDef(
         "Softmax",
@@ -245,6 +274,7 @@ OPS = (
         lambda node, x: softmax64(x).astype(x.dtype),
         direct("Softmax", axis=-1),
         (T,),
+        nn=nn.softmax(Activation.SOFTMAX),
         litert=builtin("SOFTMAX", beta=1.0),
         loops=loops.softmax(log=False),
         precision="approximate",
@@ -257,6 +287,7 @@ OPS = (
         _log_softmax,
         direct("LogSoftmax", axis=-1),
         (T,),
+        nn=nn.softmax(Activation.LOG_SOFTMAX),
         litert=builtin("LOG_SOFTMAX"),
         loops=loops.softmax(log=True),
         precision="approximate",

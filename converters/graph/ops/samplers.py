@@ -9,6 +9,9 @@ import numpy as np
 
 from converters.graph.nodes import Node
 from converters.graph.ops.arrays import target_dims
+from converters.graph.ops.barracuda import layers as nn
+from converters.graph.ops.barracuda.base import FIRST, Nn
+from converters.graph.ops.barracuda.vocabulary import LayerType
 from converters.graph.ops.base import (
     Attr,
     Kernel,
@@ -21,9 +24,7 @@ from converters.graph.ops.base import (
     type_attr,
 )
 from converters.graph.ops.litert.arrays import multinomial, random
-from converters.graph.ops.litert.base import Litert
 from converters.graph.ops.loops import layers as loops
-from converters.graph.ops.loops.base import Loops
 from converters.graph.types import INT64, Dim, Symbols, TensorType
 
 _SEEDS = (Attr("seed", "int", 0), Attr("seed2", "int", 0))
@@ -110,18 +111,9 @@ def _lower_multinomial(node: Node, builder: OnnxBuilder) -> Any:
     )
 
 
-def _of_shape(
-    name: str,
-    kernel: Kernel,
-    lowering: Lower | None,
-    sampler: Sampler,
-    litert: Litert | None = None,
-    loops: Loops | None = None,
-) -> OpDef:
+def _of_shape(name: str, kernel: Kernel, lowering: Lower | None, sampler: Sampler, **facets: Any) -> OpDef:
     attrs = (*_SEEDS, Attr("dtype", "type"), type_attr("T"))
-    return OpDef(
-        name, _infer_random, kernel, lowering, attrs, litert=litert, loops=loops, foldable=False, sampler=sampler
-    )
+    return OpDef(name, _infer_random, kernel, lowering, attrs, foldable=False, sampler=sampler, **facets)
 
 
 OPS = (
@@ -130,8 +122,9 @@ OPS = (
         _normal,
         _lower_random("RandomNormalLike"),
         "normal",
-        random("RANDOM_STANDARD_NORMAL"),
-        loops.normal,
+        nn=nn.random(LayerType.RANDOM_NORMAL),
+        litert=random("RANDOM_STANDARD_NORMAL"),
+        loops=loops.normal,
     ),
     _of_shape("TruncatedNormal", _truncated_normal, None, "truncated normal", loops=loops.truncated_normal),
     _of_shape(
@@ -139,8 +132,9 @@ OPS = (
         _uniform,
         _lower_random("RandomUniformLike"),
         "uniform",
-        random("RANDOM_UNIFORM"),
-        loops.uniform,
+        nn=nn.random(LayerType.RANDOM_UNIFORM),
+        litert=random("RANDOM_UNIFORM"),
+        loops=loops.uniform,
     ),
     OpDef(
         "Multinomial",
@@ -148,6 +142,11 @@ OPS = (
         _multinomial,
         _lower_multinomial,
         (*_SEEDS, type_attr("T"), Attr("output_dtype", "type", INT64, since="1.7")),
+        nn=Nn(
+            nn.drawn_class,
+            FIRST,
+            "a drawn class is read on inside the policy, and ML-Agents draws it from the scores itself",
+        ),
         litert=multinomial,
         loops=loops.multinomial,
         foldable=False,

@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 
 from converters.graph.nodes import Node
-from converters.graph.ops import barracuda
+from converters.graph.ops.barracuda import arrays as nn
+from converters.graph.ops.barracuda import decompositions
+from converters.graph.ops.barracuda.base import Nn
 from converters.graph.ops.base import (
     Attr,
     OnnxBuilder,
@@ -325,6 +327,7 @@ OPS = (
         _slice,
         _lower_slice,
         (T, type_attr("Index", "in:1")),
+        nn=Nn(nn.slice_),
         litert=_litert_slice,
         loops=loops.slice_,
         moves="pick",
@@ -336,6 +339,7 @@ OPS = (
         _lower_strided_slice,
         (T, type_attr("Index", "in:1"), *_MASKS),
         tfjs=_tfjs_strided_slice,
+        nn=nn.strided_slice(strided_steps),
         litert=_litert_strided_slice,
         loops=_loops_strided_slice,
         moves="pick",
@@ -346,7 +350,8 @@ OPS = (
         _gather,
         _lower_gather,
         (type_attr("Tparams"), type_attr("Tindices", "in:1"), Attr("validate_indices", "bool", True)),
-        barracuda=barracuda.GATHER,
+        barracuda=decompositions.GATHER,
+        nn=Nn(nn.gather, (0, 2)),
         litert=gather,
         loops=loops.gather,
         moves="pick",
@@ -364,7 +369,8 @@ OPS = (
             type_attr("Taxis", "in:2"),
             Attr("batch_dims", "int", 0, since="1.14", supported=False),
         ),
-        barracuda=barracuda.GATHER,
+        barracuda=decompositions.GATHER,
+        nn=Nn(nn.gather, (0, 2)),
         litert=gather,
         loops=loops.gather,
         moves="pick",

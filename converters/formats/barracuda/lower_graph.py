@@ -1,87 +1,22 @@
-"""Which function writes which op, which of its inputs are data, and the walk over a graph."""
+"""A policy's graph as layers: each op's entry says how it is written (``OpDef.nn``), here is the way through them."""
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
-from converters.formats.barracuda import lower_arrays as arrays
-from converters.formats.barracuda import lower_elementwise as elementwise
-from converters.formats.barracuda import lower_linear as linear
-from converters.formats.barracuda.lower_base import NnBuilder
-from converters.formats.barracuda.lower_values import Value
 from converters.graph.nodes import Graph, Node, node_of, normal_ref, reachable, ref
-from converters.graph.ops.base import MISFIT, misfit
-from converters.graph.ops.table import op_of
+from converters.graph.ops.barracuda.builder import NnBuilder
+from converters.graph.ops.barracuda.elementwise import swish
+from converters.graph.ops.barracuda.values import Value
+from converters.graph.ops.base import MISFIT, OpDef, misfit
+from converters.graph.ops.table import is_fed, op_of, traits
 from converters.graph.shapes import run_kernel
 from converters.graph.types import BATCH
 from signatures.errors import UnsupportedOpError
-
-#: Takes (builder, the op's data inputs) and gives its output, or all of them.
-Lower = Callable[[NnBuilder, Sequence[Value]], "Value | tuple[Value, ...]"]
-
-
-def _layerless(b: NnBuilder, args: Sequence[Value]) -> Value:
-    """Raise UnsupportedOpError: an op that is decomposed, in a form that cannot be."""
-    raise _unknown_error(b, b.node)
-
-
-_FIRST = slice(0, 1)
-_ALL = slice(None)
-
-#: Op → (function, the inputs that are data: the others are read as constants).
-_OPS: Mapping[str, tuple[Lower, slice]] = {
-    **dict.fromkeys(elementwise.ACTIVATIONS, (elementwise.activation, _ALL)),
-    **dict.fromkeys(elementwise.FORMULAS, (elementwise.formula, _ALL)),
-    **dict.fromkeys(elementwise.TWO, (elementwise.both, _ALL)),
-    **dict.fromkeys(elementwise.COMPARED, (elementwise.compare, _ALL)),
-    "Sub": (elementwise.subtract, _ALL),
-    "RealDiv": (elementwise.divide, _ALL),
-    "Pow": (elementwise.power, _ALL),
-    "FloorDiv": (elementwise.floor_divide, _ALL),
-    "SquaredDifference": (elementwise.squared_difference, _ALL),
-    "ClipByValue": (elementwise.clip, _ALL),
-    "AddN": (elementwise.add_n, _ALL),
-    **dict.fromkeys(
-        ("Cast", "Identity", "StopGradient", "PreventGradient", "Snapshot", "CheckNumerics"), (arrays.same, _FIRST)
-    ),
-    **dict.fromkeys(("Reshape", "Squeeze", "ExpandDims"), (arrays.reshape, _FIRST)),
-    "Transpose": (arrays.transpose, _FIRST),
-    "ConcatV2": (arrays.concat, slice(0, -1)),
-    "Pack": (arrays.pack, _ALL),
-    "Unpack": (arrays.unpack, _ALL),
-    "Split": (arrays.split, slice(1, 2)),
-    "SplitV": (arrays.split, _FIRST),
-    "Slice": (arrays.slice_, _FIRST),
-    "StridedSlice": (arrays.strided_slice, _FIRST),
-    "Gather": (arrays.gather, slice(0, 2)),
-    "GatherV2": (arrays.gather, slice(0, 2)),
-    "OneHot": (_layerless, _FIRST),
-    **dict.fromkeys(("Select", "SelectV2"), (_layerless, _ALL)),
-    "Tile": (arrays.tile, _FIRST),
-    "BroadcastTo": (arrays.broadcast_to, _FIRST),
-    **dict.fromkeys(("Fill", "ZerosLike", "OnesLike"), (arrays.fill_constant, slice(0, 0))),
-    **dict.fromkeys(("Pad", "PadV2"), (arrays.pad, _FIRST)),
-    **dict.fromkeys(("MatMul", "BatchMatMul"), (linear.matmul, _ALL)),
-    "Conv2D": (linear.conv2d, _ALL),
-    **dict.fromkeys(("_FusedMatMul", "_FusedConv2D"), (linear.fused_layer, _ALL)),
-    "DepthwiseConv2dNative": (linear.depthwise, _ALL),
-    **dict.fromkeys(("MaxPool", "AvgPool"), (linear.pool, _FIRST)),
-    **dict.fromkeys(("Sum", "Mean", *linear.REDUCED), (linear.reduce, _FIRST)),
-    **dict.fromkeys(("Softmax", "LogSoftmax"), (linear.softmax, _ALL)),
-    **dict.fromkeys(("ArgMax", "ArgMin"), (linear.arg_best, _FIRST)),
-    "Multinomial": (linear.drawn_class, _FIRST),
-    **dict.fromkeys(("RandomStandardNormal", "RandomUniform"), (linear.random, slice(0, 0))),
-}
-
-_WHY: Mapping[str, str] = {
-    "Multinomial": "a drawn class is read on inside the policy, and ML-Agents draws it from the scores itself",
-    "OneHot": "it takes a row of indices per agent, and gives the classes on the last axis",
-    **dict.fromkeys(("Select", "SelectV2"), "it chooses an infinite number, and infinity times 0 is NaN"),
-}
 
 
 def lower_graph(b: NnBuilder, graph: Graph, given: dict[str, Value], wanted: Iterable[str]) -> dict[str, Value]:
@@ -97,11 +32,11 @@ def lower_graph(b: NnBuilder, graph: Graph, given: dict[str, Value], wanted: Ite
         if node.name not in needed or node.name in given:
             continue
         b.node = node
-        swish = _swish_input(graph, node)
-        if swish is not None:
-            results: tuple[Value, ...] = (elementwise.swish(b, [_value(b, values, swish)]),)
+        gated = _swish_input(graph, node)
+        if gated is not None:
+            results: tuple[Value, ...] = (swish(b, [_value(b, values, gated)]),)
         elif (
-            node.op == "Sigmoid"
+            _is_gate(node)
             and all(_swish_input(graph, n) is not None for n in consumers[node.name])
             and (node.name not in wanted and consumers[node.name])
         ):
@@ -123,23 +58,34 @@ def _needed_nodes(b: NnBuilder, graph: Graph, wanted: Iterable[str], given: dict
         if name in given:
             return ()
         node = graph[name]
-        if node.op not in _OPS or (node.op == "Multinomial" and not b.draws):
+        entry = traits(node)
+        if entry.nn is None or (entry.sampler == "categorical" and not b.draws):
             b.node = node
             raise _unknown_error(b, node)
-        return makers(map(normal_ref, node.inputs[_OPS[node.op][1]]))
+        return makers(map(normal_ref, _data_of(entry, node)))
 
     return reachable(makers(wanted), ahead)
 
 
+def _data_of(entry: OpDef, node: Node) -> Sequence[str]:
+    """The operands that are data, by reference."""
+    assert entry.nn is not None
+    if entry.nn.data is None:
+        return entry.data_operands(node.inputs) if entry.moves else node.inputs
+    return node.inputs[slice(*entry.nn.data)]
+
+
 def _unknown_error(b: NnBuilder, node: Node) -> UnsupportedOpError:
-    if node.op == "Placeholder":
+    entry = traits(node)
+    if is_fed(node):
         return b.nn_error(
             "ML-Agents of those years has nothing to feed it with",
             "it feeds vectors, images, masks, the previous action, noise and memories; lists of entities "
             "and other inputs have no place in version 16 of the format",
             "give it a value with --set NAME=VALUE or its role with --input NAME=ROLE, or leave nn out of --to",
         )
-    return b.nn_error("no layer computes it", _WHY.get(node.op, "no layer that every Barracuda has computes it"))
+    why = "" if entry.nn is None else entry.nn.why
+    return b.nn_error("no layer computes it", why or "no layer that every Barracuda has computes it")
 
 
 def _value(b: NnBuilder, values: dict[str, Value], reference: str) -> Value:
@@ -153,15 +99,17 @@ def _value(b: NnBuilder, values: dict[str, Value], reference: str) -> Value:
 
 
 def _lower_node(b: NnBuilder, node: Node, values: dict[str, Value]) -> tuple[Value, ...]:
-    function, data = _OPS[node.op]
-    args = [_value(b, values, r) for r in node.inputs[data]]
-    # An op that repeats a constant as often as there are agents gives what is only known when the graph runs.
     entry = op_of(node)
+    nn = entry.nn
+    assert nn is not None
+    args = [_value(b, values, r) for r in _data_of(entry, node)]
+    # An op that repeats a constant as often as there are agents gives what is only known when the graph runs.
     if args and entry.moves != "repeat" and all(a.array is not None for a in args):
         return _compute_constant(b, node, values)
-    flattens = entry.layer == "dense" and node.op != "BatchMatMul"
+    if nn.lower is None:
+        raise _unknown_error(b, node)
     try:
-        result = function(b, [a if flattens else b.flatten_if_due(a) for a in args])
+        result = nn.lower(b, [a if nn.takes_images else b.flatten_if_due(a) for a in args])
     except MISFIT as error:
         raise misfit(node, error) from error
     return result if isinstance(result, tuple) else (result,)
@@ -190,12 +138,16 @@ def _compute_constant(b: NnBuilder, node: Node, values: dict[str, Value]) -> tup
     return tuple(Value(s, array=a) for s, a in zip(shapes, arrays_, strict=True))
 
 
+def _is_gate(node: Node) -> bool:
+    return traits(node).activation == "sigmoid"
+
+
 def _swish_input(graph: Graph, node: Node) -> str | None:
     """The x of x·sigmoid(x), None where the node is something else."""
-    if node.op != "Mul" or len(node.inputs) != 2:
+    if traits(node).operand != "factor" or len(node.inputs) != 2:
         return None
     for x, gate in (node.inputs, node.inputs[::-1]):
         made = graph.producer(gate)
-        if made.op == "Sigmoid" and normal_ref(made.inputs[0]) == normal_ref(x):
+        if _is_gate(made) and normal_ref(made.inputs[0]) == normal_ref(x):
             return normal_ref(x)
     return None

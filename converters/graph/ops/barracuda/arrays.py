@@ -7,16 +7,18 @@ that an LSTM reads is then the memory itself, not a slice of a slice (which Barr
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
 
 import numpy as np
 from msgspec.structs import replace
 
-from converters.formats.barracuda.lower_base import NnBuilder
-from converters.formats.barracuda.lower_values import Axes, Value, rows_first, usual_axes
-from converters.formats.barracuda.vocabulary import C, H, LayerType, N, W
 from converters.graph.nodes import ref
-from converters.graph.ops.slicing import strided_steps
+from converters.graph.ops.barracuda.base import NONE, Nn
+from converters.graph.ops.barracuda.builder import NnBuilder
+from converters.graph.ops.barracuda.values import Axes, Value, rows_first, usual_axes
+from converters.graph.ops.barracuda.vocabulary import C, H, LayerType, N, W
 from converters.graph.types import BATCH, Dim
 
 #: What is refused, and why.
@@ -175,18 +177,21 @@ def write_constant(b: NnBuilder, value: Value, axes: Axes) -> Value:
     return b.layer_value(name, value.shape, axes)
 
 
-def split(b: NnBuilder, args: Sequence[Value]) -> tuple[Value, ...]:
-    """Split and SplitV: pieces one after the other along an axis."""
-    axis_at = 0 if b.node.op == "Split" else 2
-    value = b.flatten_if_due(args[0])
-    axis = int(b.constant_operand(axis_at, "the axis")) % len(value.shape)
-    start, results = 0, []
-    for index in range(int(b.node.attrs["num_split"])):
-        length = b.shape_of(ref(b.node.name, index))[axis]
-        assert isinstance(length, int)
-        results.append(take_range(b, value, axis, start, start + length))
-        start += length
-    return tuple(results)
+def split(axis_at: int) -> Nn:
+    """Split and SplitV: pieces one after the other along the axis that an operand says."""
+
+    def lower(b: NnBuilder, args: Sequence[Value]) -> tuple[Value, ...]:
+        value = b.flatten_if_due(args[0])
+        axis = int(b.constant_operand(axis_at, "the axis")) % len(value.shape)
+        start, results = 0, []
+        for index in range(int(b.node.attrs["num_split"])):
+            length = b.shape_of(ref(b.node.name, index))[axis]
+            assert isinstance(length, int)
+            results.append(take_range(b, value, axis, start, start + length))
+            start += length
+        return tuple(results)
+
+    return Nn(lower)
 
 
 def unpack(b: NnBuilder, args: Sequence[Value]) -> tuple[Value, ...]:
@@ -242,12 +247,16 @@ def slice_(b: NnBuilder, args: Sequence[Value]) -> Value:
     return value
 
 
-def strided_slice(b: NnBuilder, args: Sequence[Value]) -> Value:
+def strided_slice(steps_of: Callable[..., Sequence[tuple[Any, ...]]]) -> Nn:
     """StridedSlice: bounds, new axes and axes that are dropped; steps other than 1 take element by element."""
+    return Nn(partial(_take_steps, steps_of=steps_of))
+
+
+def _take_steps(b: NnBuilder, args: Sequence[Value], *, steps_of: Callable[..., Sequence[tuple[Any, ...]]]) -> Value:
     value = b.flatten_if_due(args[0])
     operands = [b.constant_operand(i, "the bounds of a slice").tolist() for i in (1, 2, 3)]
     axis, gone = 0, []
-    for step in strided_steps(b.node, len(value.shape), *operands):
+    for step in steps_of(b.node, len(value.shape), *operands):
         if step[0] == "new":
             shape = (*value.shape[:axis], 1, *value.shape[axis:])
             value = replace(value, shape=shape, axes=(*value.axes[:axis], None, *value.axes[axis:]))
@@ -356,14 +365,19 @@ def broadcast_to(b: NnBuilder, args: Sequence[Value]) -> Value:
     return value
 
 
-def fill_constant(b: NnBuilder, args: Sequence[Value]) -> Value:
-    """Fill, ZerosLike, OnesLike: a constant with a row per agent."""
-    shape = b.shape_of(b.node.name)
-    if b.node.op == "Fill":
-        number = b.constant_operand(1, "what it fills with")
-    else:
-        number = np.array(0 if b.node.op == "ZerosLike" else 1, b.type_of(b.node.inputs[0]).dtype)
-    return constant_of(b, number, shape)
+def fill(b: NnBuilder, args: Sequence[Value]) -> Value:
+    """One number in a row per agent."""
+    return constant_of(b, b.constant_operand(1, "what it fills with"), b.shape_of(b.node.name))
+
+
+def full_like(number: int) -> Nn:
+    """The same number in the shape of the operand."""
+
+    def lower(b: NnBuilder, args: Sequence[Value]) -> Value:
+        array = np.array(number, b.type_of(b.node.inputs[0]).dtype)
+        return constant_of(b, array, b.shape_of(b.node.name))
+
+    return Nn(lower, NONE)
 
 
 def constant_of(b: NnBuilder, array: np.ndarray, shape: tuple[Dim, ...]) -> Value:
@@ -377,7 +391,9 @@ def pad(b: NnBuilder, args: Sequence[Value]) -> Value:
     """A border around the image; numbers in front of or behind the channels are joined on."""
     value, shape = b.flatten_if_due(args[0]), b.shape_of(b.node.name)
     pairs = [(int(x), int(y)) for x, y in b.constant_operand(1, "the widths of the border").tolist()]
-    fill = 0.0 if b.node.op == "Pad" else float(b.constant_operand(2, "the number that it fills with").reshape(()))
+    number = 0.0
+    if len(b.node.inputs) > 2:
+        number = float(b.constant_operand(2, "the number that it fills with").reshape(()))
     edges = dict.fromkeys((H, W), (0, 0))
     for axis, (low, high) in enumerate(pairs):
         place = value.axes[axis]
@@ -392,7 +408,7 @@ def pad(b: NnBuilder, args: Sequence[Value]) -> Value:
         for count, at in ((low, 0), (high, 2)):
             if count:
                 lengths = tuple(count if i == axis else d for i, d in enumerate(value.shape))
-                parts.insert(at, constant_of(b, np.array(fill, np.float32), lengths))
+                parts.insert(at, constant_of(b, np.array(number, np.float32), lengths))
         longer = tuple(d + low + high if i == axis and isinstance(d, int) else d for i, d in enumerate(value.shape))
         value = join_along(b, parts, axis, longer)
     if all(pair == (0, 0) for pair in edges.values()):
@@ -400,5 +416,5 @@ def pad(b: NnBuilder, args: Sequence[Value]) -> Value:
     n, h, w, c = value.dims
     (top, bottom), (left, right) = edges[H], edges[W]
     dims = (n, h + top + bottom, w + left + right, c)
-    name = b.layer(LayerType.BORDER2D, [b.stored_name(value)], dims, pad=(left, top, right, bottom), beta=fill)
+    name = b.layer(LayerType.BORDER2D, [b.stored_name(value)], dims, pad=(left, top, right, bottom), beta=number)
     return b.layer_value(name, shape, value.axes)

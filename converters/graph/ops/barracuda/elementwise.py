@@ -1,9 +1,9 @@
-"""Ops that compute number by number: arithmetic, activations, comparisons, choices, casts.
+"""Ops that compute number by number: arithmetic, activations, comparisons.
 
 What a real Barracuda gets wrong is written in what all of them run (1.0 to 3.0): the first operand of a subtraction,
 division or minimum always has the result's lengths (the folds over several operands, and over a first operand that is
 repeated, are wrong in early versions). An activation that is younger than 1.0 does not get here: an old worker copies
-what it does not know, so the op's entry decomposes it (``graph/ops/barracuda``).
+what it does not know, so the op's entry decomposes it (``decompositions``).
 """
 
 from __future__ import annotations
@@ -13,31 +13,12 @@ from functools import partial
 
 import numpy as np
 
-from converters.formats.barracuda.lower_base import NnBuilder
-from converters.formats.barracuda.lower_values import Axes, Value, usual_axes
-from converters.formats.barracuda.vocabulary import COMPARISONS, ONE_OP, Activation, C, H, LayerType, W
+from converters.graph.ops.barracuda.base import Nn
+from converters.graph.ops.barracuda.builder import NnBuilder
+from converters.graph.ops.barracuda.values import Axes, Value, usual_axes
+from converters.graph.ops.barracuda.vocabulary import Activation, C, H, LayerType, W
 from converters.graph.types import Dim
 
-#: Activations that Barracuda lacks before 1.4, or rounds another way: decomposed.
-_UNSUPPORTED_BEFORE_1_4 = frozenset(
-    (
-        *(Activation.SOFTPLUS, Activation.SOFTSIGN, Activation.ROUND),
-        *(Activation.COS, Activation.SIN, Activation.TAN, Activation.ERF),
-    )
-)
-_ACTIVATIONS = {op: Activation(kind) for kind, op in ONE_OP.items() if kind not in _UNSUPPORTED_BEFORE_1_4} | {
-    "Elu": Activation.ELU
-}
-_TWO: Mapping[str, LayerType] = {
-    "Add": LayerType.ADD,
-    "BiasAdd": LayerType.ADD,
-    "Mul": LayerType.MUL,
-    "LogicalAnd": LayerType.MUL,
-    "Minimum": LayerType.MIN,
-    "Maximum": LayerType.MAX,
-    "LogicalOr": LayerType.MAX,
-}
-_COMPARED = {op: LayerType(kind) for kind, op in COMPARISONS.items()} | {"NotEqual": LayerType.EQUAL}
 _MIRRORED: Mapping[LayerType, LayerType] = {
     LayerType.GREATER: LayerType.LESS,
     LayerType.GREATER_EQUAL: LayerType.LESS_EQUAL,
@@ -50,14 +31,14 @@ _MIRRORED: Mapping[LayerType, LayerType] = {
 # ------------------------------------------------------------------ one operand
 
 
-def activation(b: NnBuilder, args: Sequence[Value]) -> Value:
+def activation(kind: Activation) -> Nn:
     """An op that every Barracuda has as an activation."""
-    return _map_numbers(b, args[0], lambda x: b.activation(_ACTIVATIONS[b.node.op], x))
+    return Nn(lambda b, args: apply_activation(b, args[0], kind), kind=kind)
 
 
-def apply_activation(b: NnBuilder, value: Value, name: str) -> Value:
-    """The activation that another op has fused into it."""
-    return _map_numbers(b, value, lambda x: b.activation(_ACTIVATIONS[name], x, label=name))
+def apply_activation(b: NnBuilder, value: Value, kind: Activation, label: str = "") -> Value:
+    """An Activation layer behind a tensor."""
+    return _map_numbers(b, value, lambda x: b.activation(kind, x, label=label))
 
 
 def _map_numbers(b: NnBuilder, value: Value, make: Callable[[str], str]) -> Value:
@@ -65,24 +46,33 @@ def _map_numbers(b: NnBuilder, value: Value, make: Callable[[str], str]) -> Valu
     return b.layer_value(make(b.stored_name(value)), value.shape, value.axes)
 
 
-def _leaky_relu(b: NnBuilder, x: str) -> str:
+def square(b: NnBuilder, args: Sequence[Value]) -> Value:
+    """X times itself."""
+    return _map_numbers(b, args[0], lambda x: b.two(LayerType.MUL, x, x))
+
+
+def selu(alpha: float, scale: float) -> Nn:
+    """The activation, which is told its two numbers."""
+    return Nn(
+        lambda b, args: _map_numbers(b, args[0], lambda x: b.activation(Activation.SELU, x, alpha=alpha, beta=scale))
+    )
+
+
+def leaky_relu(b: NnBuilder, args: Sequence[Value]) -> Value:
     """Barracuda takes the larger of x and alpha·x, which is another function beyond 1."""
     alpha = float(b.node.attrs["alpha"])
-    if 0 <= alpha <= 1:
-        return b.activation(Activation.LEAKY_RELU, x, alpha=alpha)
-    return b.two(LayerType.ADD, b.at_least(x, 0), b.scale(b.at_most(x, 0), alpha))
+
+    def write(x: str) -> str:
+        if 0 <= alpha <= 1:
+            return b.activation(Activation.LEAKY_RELU, x, alpha=alpha)
+        return b.two(LayerType.ADD, b.at_least(x, 0), b.scale(b.at_most(x, 0), alpha))
+
+    return _map_numbers(b, args[0], write)
 
 
-_FORMULAS: Mapping[str, Callable[[NnBuilder, str], str]] = {
-    "Square": lambda b, x: b.two(LayerType.MUL, x, x),
-    "LeakyRelu": _leaky_relu,
-    "Selu": lambda b, x: b.activation(Activation.SELU, x, alpha=1.6732632423543772, beta=1.0507009873554805),
-}
-
-
-def formula(b: NnBuilder, args: Sequence[Value]) -> Value:
-    """An op that is spelled out."""
-    return _map_numbers(b, args[0], lambda x: _FORMULAS[b.node.op](b, x))
+def swish(b: NnBuilder, args: Sequence[Value]) -> Value:
+    """X·sigmoid(x) as the one activation that it is in every genuine file; ``args`` is x."""
+    return apply_activation(b, args[0], Activation.SWISH)
 
 
 # ------------------------------------------------------------------ two operands
@@ -116,6 +106,11 @@ class _Pair:
     def full(self, position: int) -> bool:
         """Whether an operand has all the lengths of the result."""
         return self.b.dims_of(self.names[position]) == self.dims
+
+    @property
+    def swaps(self) -> bool:
+        """Whether the second operand goes first: it alone has all the lengths, or is computed where both have them."""
+        return not self.full(0) or (self.arrays[0] is not None and self.full(1))
 
     def pair_value(self, name: str) -> Value:
         return self.b.layer_value(name, self.shape, self.axes)
@@ -157,22 +152,18 @@ def _pair(b: NnBuilder, args: Sequence[Value]) -> _Pair:
     return _Pair(b, args, b.shape_of(b.node.name))
 
 
-def both(b: NnBuilder, args: Sequence[Value]) -> Value:
-    """Ops whose operands may change places."""
-    pair = _pair(b, args)
-    first, second = pair.names
-    if not pair.full(0) or (pair.arrays[0] is not None and pair.full(1)):
-        first, second = second, first
-    return pair.pair_value(_two(b, pair, _TWO[b.node.op], first, second))
+def pair(kind: LayerType) -> Nn:
+    """A layer of two operands that may change places."""
+
+    def lower(b: NnBuilder, args: Sequence[Value]) -> Value:
+        pair = _pair(b, args)
+        return pair.pair_value(_two(b, pair, kind, *(pair.names[::-1] if pair.swaps else pair.names)))
+
+    return Nn(lower)
 
 
 def _two(b: NnBuilder, pair: _Pair, kind: LayerType, first: str, second: str, label: str = "") -> str:
     return b.layer(kind, [first, second], pair.dims, label=label)
-
-
-def swish(b: NnBuilder, args: Sequence[Value]) -> Value:
-    """X·sigmoid(x) as the one activation that it is in every genuine file; ``args`` is x."""
-    return _map_numbers(b, args[0], lambda x: b.activation(Activation.SWISH, x))
 
 
 def subtract(b: NnBuilder, args: Sequence[Value]) -> Value:
@@ -207,9 +198,9 @@ def power(b: NnBuilder, args: Sequence[Value]) -> Value:
     if exponent is not None and exponent.size == 1 and args[0].shape == b.shape_of(b.node.name):
         number = float(exponent.reshape(()))
         if number == 0.5:
-            return _map_numbers(b, args[0], lambda x: b.activation(Activation.SQRT, x))
+            return apply_activation(b, args[0], Activation.SQRT)
         if number == 2:
-            return _map_numbers(b, args[0], lambda x: b.two(LayerType.MUL, x, x))
+            return square(b, args[:1])
     pair = _pair(b, args)
     if pair.full(0) and pair.arrays[0] is None:
         return pair.pair_value(b.two(LayerType.POW, *pair.names))
@@ -227,18 +218,18 @@ def floor_divide(b: NnBuilder, args: Sequence[Value]) -> Value:
 
 def squared_difference(b: NnBuilder, args: Sequence[Value]) -> Value:
     """(a − b)²."""
-    difference = subtract(b, args)
-    return _map_numbers(b, difference, lambda x: b.two(LayerType.MUL, x, x))
+    return square(b, [subtract(b, args)])
 
 
-def compare(b: NnBuilder, args: Sequence[Value]) -> Value:
-    """1 where it holds, else 0."""
-    pair, kind = _pair(b, args), _COMPARED[b.node.op]
-    first, second = pair.names
-    if not pair.full(0) or (pair.arrays[0] is not None and pair.full(1)):
-        first, second, kind = second, first, _MIRRORED[kind]
-    name = _two(b, pair, kind, first, second)
-    return pair.pair_value(b.shift(b.scale(name, -1), 1) if b.node.op == "NotEqual" else name)
+def compare(kind: LayerType, *, negated: bool = False) -> Nn:
+    """1 where it holds, else 0; ``negated``: the other way round."""
+
+    def lower(b: NnBuilder, args: Sequence[Value]) -> Value:
+        pair = _pair(b, args)
+        name = _two(b, pair, _MIRRORED[kind], *pair.names[::-1]) if pair.swaps else _two(b, pair, kind, *pair.names)
+        return pair.pair_value(b.shift(b.scale(name, -1), 1) if negated else name)
+
+    return Nn(lower, kind=None if negated else kind)
 
 
 def _combine(b: NnBuilder, kind: LayerType, first: Value, second: Value, shape: tuple[Dim, ...]) -> Value:
@@ -281,6 +272,3 @@ def add_n(b: NnBuilder, args: Sequence[Value]) -> Value:
     for value in args[1:]:
         total = _combine(b, LayerType.ADD, total, value, b.shape_of(b.node.name))
     return total
-
-
-ACTIVATIONS, FORMULAS, TWO, COMPARED = tuple(_ACTIVATIONS), tuple(_FORMULAS), tuple(_TWO), tuple(_COMPARED)

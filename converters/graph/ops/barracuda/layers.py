@@ -7,15 +7,16 @@ over one number (a branch of one action), and a Dense is the layer that nothing 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
-from converters.formats.barracuda.lower_base import NnBuilder
-from converters.formats.barracuda.lower_elementwise import apply_activation
-from converters.formats.barracuda.lower_values import Value
-from converters.formats.barracuda.vocabulary import Activation, C, LayerType, N
-from converters.graph.ops.table import traits
+from converters.graph.ops.barracuda.base import FIRST, NONE, Nn
+from converters.graph.ops.barracuda.builder import NnBuilder
+from converters.graph.ops.barracuda.elementwise import apply_activation
+from converters.graph.ops.barracuda.values import Value
+from converters.graph.ops.barracuda.vocabulary import Activation, C, LayerType, N
 from converters.graph.types import BATCH
 
 #: A first pad of −1 is TensorFlow's SAME.
@@ -25,12 +26,18 @@ _SAME = (-1,)
 # ------------------------------------------------------------------ products
 
 
-def fused_layer(b: NnBuilder, args: Sequence[Value]) -> Value:
-    """A product or convolution with its bias, and the activations behind it."""
-    value = (matmul if b.node.op == "_FusedMatMul" else conv2d)(b, args)
-    for name in b.node.attrs["fused_ops"][1:]:
-        value = apply_activation(b, value, name)
-    return value
+def with_activations(
+    one: Callable[[NnBuilder, Sequence[Value]], Value], kinds: Mapping[str, Activation], *, takes_images: bool = False
+) -> Nn:
+    """A product or convolution with its bias, and the activations behind it, by the names of their ops."""
+
+    def lower(b: NnBuilder, args: Sequence[Value]) -> Value:
+        value = one(b, args)
+        for name in b.node.attrs["fused_ops"][1:]:
+            value = apply_activation(b, value, kinds[name], label=name)
+        return value
+
+    return Nn(lower, takes_images=takes_images)
 
 
 def matmul(b: NnBuilder, args: Sequence[Value]) -> Value:
@@ -132,11 +139,14 @@ def _convolve(b: NnBuilder, x: Value, kernel: np.ndarray, bias: np.ndarray, kind
     return _window(b, x, kind, data)
 
 
-def pool(b: NnBuilder, args: Sequence[Value]) -> Value:
+def pool(kind: LayerType) -> Nn:
     """The largest or the mean of each window."""
-    height, width = (int(k) for k in b.node.attrs["ksize"][1:3])
-    kind = LayerType.MAX_POOL2D if b.node.op == "MaxPool" else LayerType.AVG_POOL2D
-    return _window(b, args[0], kind, [], pool=(width, height))
+
+    def lower(b: NnBuilder, args: Sequence[Value]) -> Value:
+        height, width = (int(k) for k in b.node.attrs["ksize"][1:3])
+        return _window(b, args[0], kind, [], pool=(width, height))
+
+    return Nn(lower)
 
 
 def _window(
@@ -156,19 +166,12 @@ def _window(
 # ------------------------------------------------------------------ reductions
 
 
-_REDUCED = {
-    "Max": LayerType.REDUCE_MAX,
-    "Any": LayerType.REDUCE_MAX,
-    "Min": LayerType.REDUCE_MIN,
-    "All": LayerType.REDUCE_MIN,
-    "Prod": LayerType.REDUCE_PROD,
-}
-#: Ops that one layer of its own reduces by; sums and means are products.
-REDUCED = tuple(_REDUCED)
-
-
-def reduce(b: NnBuilder, args: Sequence[Value]) -> Value:
+def reduction(kind: LayerType) -> Nn:
     """Sum, mean, largest, smallest, product: over everything that an agent has, over the channels, or over an image."""
+    return Nn(partial(_reduce, kind=kind), FIRST)
+
+
+def _reduce(b: NnBuilder, args: Sequence[Value], *, kind: LayerType) -> Value:
     value, shape = b.flatten_if_due(args[0]), b.shape_of(b.node.name)
     axes = {int(a) % len(value.shape) for a in np.atleast_1d(b.constant_operand(1, "the axes"))}
     long = [i for i in axes if value.shape[i] != 1]
@@ -180,22 +183,24 @@ def reduce(b: NnBuilder, args: Sequence[Value]) -> Value:
     places = tuple(None if i in axes else value.axes[i] for i in kept)
     name = b.stored_name(value)
     if long:
-        name = _reduce(b, value, name, [value.axes[i] for i in long], whole=not left)
+        name = _reduce_places(b, kind, value, name, [value.axes[i] for i in long], whole=not left)
     return b.layer_value(name, shape, places)
 
 
-def _reduce(b: NnBuilder, value: Value, name: str, places: Sequence[int | None], *, whole: bool) -> str:
+def _reduce_places(
+    b: NnBuilder, kind: LayerType, value: Value, name: str, places: Sequence[int | None], *, whole: bool
+) -> str:
     reduced = None
-    if b.node.op not in _REDUCED:
-        reduced = _sum(b, value, name, places, whole=whole, mean=traits(b.node).takes == "mean")
-    elif _REDUCED[b.node.op] is LayerType.REDUCE_MAX and C not in places:
+    if kind in (LayerType.REDUCE_SUM, LayerType.REDUCE_MEAN):
+        reduced = _sum(b, value, name, places, whole=whole, mean=kind is LayerType.REDUCE_MEAN)
+    elif kind is LayerType.REDUCE_MAX and C not in places:
         reduced = _pool_places(b, LayerType.MAX_POOL2D, value, name, places)[0]
     elif whole and len(places) > 1:
         n, h, w, c = value.dims
         flat = b.layer(LayerType.FLATTEN, [name], (n, 1, 1, h * w * c), label="flat")
-        reduced = b.layer(_REDUCED[b.node.op], [flat], (n, 1, 1, 1))
+        reduced = b.layer(kind, [flat], (n, 1, 1, 1))
     elif places == [C]:
-        reduced = b.layer(_REDUCED[b.node.op], [name], (*value.dims[:3], 1))
+        reduced = b.layer(kind, [name], (*value.dims[:3], 1))
     if reduced is None:
         what = f"a {b.node.op} of {list(value.shape)} over part of the image"
         raise b.nn_error(what, "version 16 reduces over the channels")
@@ -233,22 +238,29 @@ def _pool_places(
     return b.layer(kind, [name], dims, pool=size, stride=size, label="pooled"), down * across
 
 
-def softmax(b: NnBuilder, args: Sequence[Value]) -> Value:
+def softmax(kind: Activation) -> Nn:
     """Softmax and its logarithm, over a row."""
-    value = args[0]
-    kind = Activation.SOFTMAX if b.node.op == "Softmax" else Activation.LOG_SOFTMAX
-    if sum(d not in (1, BATCH) for d in value.shape) > 1 or (value.size > 1 and value.shape[-1] == 1):
-        raise b.nn_error(f"a tensor of shape {list(value.shape)}", "Barracuda up to 1.4 takes a whole row")
-    x = b.flatten_if_due(value)
-    return b.layer_value(b.activation(kind, b.rows(x)), x.shape, x.axes)
+
+    def lower(b: NnBuilder, args: Sequence[Value]) -> Value:
+        value = args[0]
+        if sum(d not in (1, BATCH) for d in value.shape) > 1 or (value.size > 1 and value.shape[-1] == 1):
+            raise b.nn_error(f"a tensor of shape {list(value.shape)}", "Barracuda up to 1.4 takes a whole row")
+        x = b.flatten_if_due(value)
+        return b.layer_value(b.activation(kind, b.rows(x)), x.shape, x.axes)
+
+    return Nn(lower)
 
 
-def arg_best(b: NnBuilder, args: Sequence[Value]) -> Value:
-    """ArgMax and ArgMin: the first class of a row that scores highest, or lowest.
+def arg_best(kind: LayerType) -> Nn:
+    """ArgMax and ArgMin: the first class of a row that scores highest, or lowest; ``kind`` tells that score.
 
     Of layers that every Barracuda has (ArgMax is one from 1.4 on): the place of the one that is as large as the
     largest, and before which there is no other.
     """
+    return Nn(partial(_first_best, kind=kind), FIRST)
+
+
+def _first_best(b: NnBuilder, args: Sequence[Value], *, kind: LayerType) -> Value:
     value = b.flatten_if_due(args[0])
     axis = int(b.constant_operand(1, "the axis").reshape(())) % len(value.shape)
     width, row = value.size, [i for i, d in enumerate(value.shape) if d not in (1, BATCH)]
@@ -258,7 +270,6 @@ def arg_best(b: NnBuilder, args: Sequence[Value]) -> Value:
     if width == 1:
         return b.result(b.constant_rows(np.zeros(1, np.float32), "only"))
     pairs = b.table(width, width)
-    kind = LayerType.REDUCE_MAX if b.node.op == "ArgMax" else LayerType.REDUCE_MIN
     top = b.layer(kind, [x], (b.dims_of(x)[N], 1, 1, 1), label="top")
     best = b.two(LayerType.EQUAL, x, b.spread(top, width), "is_best")
     before = b.dense(best, np.triu(np.ones(pairs), 1), np.zeros(width), "before")
@@ -277,14 +288,13 @@ def drawn_class(b: NnBuilder, args: Sequence[Value]) -> Value:
     return b.layer_value(name, b.shape_of(b.node.name), (N, None if count == 1 else C))
 
 
-def random(b: NnBuilder, args: Sequence[Value]) -> Value:
+def random(kind: LayerType) -> Nn:
     """Noise of the shape of a tensor that is there, as the trainers' converter writes it; not seeded."""
+    return Nn(partial(_draw, kind=kind), NONE)
+
+
+def _draw(b: NnBuilder, args: Sequence[Value], *, kind: LayerType) -> Value:
     shape = b.shape_of(b.node.name)
-    return noise(b, shape, LayerType.RANDOM_NORMAL if b.node.op == "RandomStandardNormal" else LayerType.RANDOM_UNIFORM)
-
-
-def noise(b: NnBuilder, shape: tuple[int | str, ...], kind: LayerType = LayerType.RANDOM_NORMAL) -> Value:
-    """A tensor of drawn numbers."""
     flat = (BATCH, math.prod(d for d in shape if isinstance(d, int)))
     if shape[:1] != (BATCH,) or len(shape) != 2:
         raise b.nn_error(f"it draws a tensor of shape {list(shape)}", "a row of numbers per agent can be drawn")

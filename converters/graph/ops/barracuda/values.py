@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
-from converters.formats.barracuda.vocabulary import C, N
+from converters.graph.ops.barracuda.vocabulary import C, N
 from converters.graph.types import BATCH, Dim
 
 Array = npt.NDArray[np.float32]

@@ -5,7 +5,6 @@ Source: Barracuda's ``Layer.Type`` and ``Layer.Activation`` (Model.cs of 0.1.x t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from enum import IntEnum
 
 
@@ -147,50 +146,8 @@ class Activation(IntEnum):
     ERF = 211
 
 
-#: Activations that are one op.
-ONE_OP: Mapping[int, str] = {
-    Activation.RELU: "Relu",
-    Activation.TANH: "Tanh",
-    Activation.SIGMOID: "Sigmoid",
-    Activation.RELU6: "Relu6",
-    Activation.SOFTPLUS: "Softplus",
-    Activation.ABS: "Abs",
-    Activation.NEG: "Neg",
-    Activation.CEIL: "Ceil",
-    Activation.FLOOR: "Floor",
-    Activation.ROUND: "Round",
-    Activation.RECIPROCAL: "Reciprocal",
-    Activation.SQRT: "Sqrt",
-    Activation.EXP: "Exp",
-    Activation.LOG: "Log",
-    Activation.COS: "Cos",
-    Activation.SIN: "Sin",
-    Activation.TAN: "Tan",
-    Activation.ERF: "Erf",
-    Activation.SOFTSIGN: "Softsign",
-}
-#: Comparisons, whose results are 1 and 0, and their ops.
-COMPARISONS: Mapping[int, str] = {
-    LayerType.GREATER: "Greater",
-    LayerType.GREATER_EQUAL: "GreaterEqual",
-    LayerType.LESS: "Less",
-    LayerType.LESS_EQUAL: "LessEqual",
-    LayerType.EQUAL: "Equal",
-}
-
 #: Positions of the axes in the four-entry shapes of versions up to 16.
 N, H, W, C = range(4)
-#: Positions of N, H, W, C in the eight-entry shapes of versions from 17 on: S, R, N, T, D, H, W, C.
-EIGHT = (2, 5, 6, 7)
-
-
-#: The ``version_number`` from which on classes are drawn in the model and memories are inputs and outputs.
-_DRAWS_IN_MODEL = 3
-
-
-def draws_in_model(version: float) -> bool:
-    """Whether a model of this API version of ML-Agents draws classes by itself and has its memory as an input."""
-    return version >= _DRAWS_IN_MODEL
 
 
 def layer_label(number: int) -> str:

@@ -295,6 +295,6 @@ GATHER = Decomposition("", _gather)
 #: A ``.nn`` cuts and fills without layers of their own.
 SPLIT = Decomposition("Split", _split, nn=False)
 ZEROS_LIKE = Decomposition("Expand", _zeros_like, nn=False)
-#: In a ``.nn`` the layout of both operands decides (formats/barracuda).
+#: In a ``.nn`` the layout of both operands decides (``elementwise.subtract``).
 SUB = Decomposition("Sub", _undo("Neg", "Add"), nn=False)
 DIV = Decomposition("Div", _undo("Reciprocal", "Mul"), nn=False)

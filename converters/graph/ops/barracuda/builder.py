@@ -1,4 +1,4 @@
-"""The layers of a ``.nn`` that are written so far, and the tensors that they give (``lower_values``)."""
+"""The layers of a ``.nn`` that are written so far, and the tensors that they give (``values``)."""
 
 from __future__ import annotations
 
@@ -6,18 +6,17 @@ import bisect
 import itertools
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 from msgspec.structs import replace
 
-from converters.formats.barracuda.lower_values import FREE, Array, Axes, Dims, Piece, Value, usual_axes
-from converters.formats.barracuda.vocabulary import Activation, C, LayerType, N
 from converters.graph.nn.choosing import MAX_TABLE
 from converters.graph.nodes import NameScope, Node
-from converters.graph.shapes import Types
+from converters.graph.ops.barracuda.values import FREE, Array, Axes, Dims, Piece, Value, usual_axes
+from converters.graph.ops.barracuda.vocabulary import Activation, C, LayerType, N
 from converters.graph.size_limits import MAX_MADE, Allowance
 from converters.graph.types import BATCH, Dim, TensorType
 from signatures.errors import UnsupportedOpError
@@ -52,7 +51,7 @@ class NnBuilder:
     once for all agents.
     """
 
-    def __init__(self, types: Types, names: Sequence[str], *, draws: bool = False) -> None:
+    def __init__(self, types: Mapping[str, TensorType], names: Sequence[str], *, draws: bool = False) -> None:
         self.types, self.draws = types, draws
         self.drafts: list[Draft] = []
         self.node = Node("", "NoOp")

@@ -1,0 +1,1 @@
+"""What an op becomes for Barracuda: layers of a ``.nn`` (``OpDef.nn``), or ops that it has (``OpDef.barracuda``)."""
