@@ -151,8 +151,9 @@ def _lower_depthwise(node: Node, builder: OnnxBuilder) -> Any:
 
 
 def _tfjs_convolution(builder: GraphBuilder, node: Node, types: Mapping[str, TensorType]) -> Node:
-    """TensorFlow.js on wasm gives zeros for SAME whose windows leave a rest, which is less than nothing to pad: Pad and
-    VALID.
+    """Pad and a VALID convolution in place of a SAME one whose windows leave a rest, which is less than nothing to pad.
+
+    TensorFlow.js on wasm gives zeros for it.
     """
     image, kernel = types[node.inputs[0]].shape, types[node.inputs[1]].shape
     if node.attrs["padding"] != "SAME" or image is None or kernel is None:

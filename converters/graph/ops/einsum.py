@@ -66,8 +66,10 @@ def labels_of(term: str, shape: Sequence[Dim]) -> list[tuple[str, Dim]]:
 def _written_out(
     b: NodeBuilder, terms: Sequence[str], tensors: Sequence[str], result: str, name: str, shapes: Sequence[Shape]
 ) -> tuple[list[str], list[str], str]:
-    """(terms, tensors, result) with a label for each axis of a ``…``. The axes are counted from the last, as numpy
-    broadcasts; one of length 1 is taken off where another operand has it longer.
+    """Return (terms, tensors, result) with a label for each axis of a ``…``.
+
+    The axes are counted from the last, as numpy broadcasts; one of length 1 is taken off where another operand has it
+    longer.
     """
     axes = [_dotted_axes(term, shape) for term, shape in zip(terms, shapes, strict=True)]
     most = max(map(len, axes))

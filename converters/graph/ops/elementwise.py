@@ -74,8 +74,10 @@ def _binary(name: str, function: Callable[..., np.ndarray], lower: str | Lower, 
 
 
 def _pair(name: str) -> Lower:
-    """An ONNX op of two operands. A constant is written without leading axes of length 1 where the other operand has
-    as many: Barracuda 1.1 gives the result of [B, n] and [1, n] another shape (Add_02).
+    """An ONNX op of two operands.
+
+    A constant is written without leading axes of length 1 where the other operand has as many: Barracuda 1.1 gives the
+    result of [B, n] and [1, n] another shape (Add_02).
     """
 
     def lower(node: Node, builder: OnnxBuilder) -> str:

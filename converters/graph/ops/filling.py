@@ -118,8 +118,10 @@ def _lower_one_hot(node: Node, builder: OnnxBuilder) -> Any:
 
 
 def _tfjs_one_hot(builder: GraphBuilder, node: Node, types: Mapping[str, TensorType]) -> Node:
-    """TensorFlow.js has OneHot over the last axis alone, of no depth of 1, and on wasm of int32 values only (floats
-    come out as bit patterns): on and off are applied after a cast, off + hot·(on − off).
+    """OneHot as TensorFlow.js has it: on and off are applied after a cast, off + hot·(on − off).
+
+    It has OneHot over the last axis alone, of no depth of 1, and on wasm of int32 values only (floats come out as bit
+    patterns).
     """
     indices, depth, on, off = node.inputs
     on_value, off_value = types[on].constant, types[off].constant

@@ -59,8 +59,9 @@ def _square(part: np.ndarray) -> np.ndarray:
 
 
 def _product(a: np.ndarray, b: np.ndarray, wide: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """In float64; of a large matrix a piece at a time, as it lies in memory: it is never held in twice its bytes
-    (which takes longer, too).
+    """The product in float64; of a large matrix a piece at a time, as it lies in memory.
+
+    So the matrix is never held in twice its bytes (which takes longer, too).
     """
     if b.size <= _LARGE or b.ndim > 2:
         return np.asarray(a @ wide(b))

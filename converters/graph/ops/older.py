@@ -106,8 +106,10 @@ def _batch_norm(builder: GraphBuilder, node: Node) -> str:
 
 
 def _is_layer_norm(builder: GraphBuilder, node: Node) -> bool:
-    """Whether a training FusedBatchNorm is Keras 2's LayerNormalization: rows as channels of one image [1, B, n, 1],
-    scaled by ones and moved by zeros. No row hangs on another then.
+    """Whether a training FusedBatchNorm is Keras 2's LayerNormalization.
+
+    That has rows as channels of one image [1, B, n, 1], scaled by ones and moved by zeros. No row hangs on another
+    then.
     """
     image, scale, offset = (builder.producer(normal_ref(r)) for r in node.inputs[:3])
     if node.attrs.get("data_format") != "NCHW" or image.op != "Reshape":
@@ -125,9 +127,10 @@ def _is_layer_norm(builder: GraphBuilder, node: Node) -> bool:
 
 
 def _channels_are_rows(builder: GraphBuilder, image: str, tensor: str) -> bool:
-    """Whether an image [1, B, n, 1] of a tensor has no numbers of two agents in one channel: n is a number, and what
-    lies behind the axis of the agents (the last that is free) is one such row, or several. [1, n, B, 1] of the tensor
-    turned round is a batch norm over the agents.
+    """Whether an image [1, B, n, 1] of a tensor has no numbers of two agents in one channel.
+
+    So it is where n is a number, and what lies behind the axis of the agents (the last that is free) is one such row,
+    or several. [1, n, B, 1] of the tensor turned round is a batch norm over the agents.
     """
     shown, dims = builder.shape_of(image), builder.shape_of(tensor)
     if shown is None or dims is None or len(shown) != 4 or not isinstance(shown[2], int):

@@ -154,13 +154,13 @@ _CHOICES: tuple[tuple[str, Callable[..., Any], str, Literal["largest", "smallest
 def _emit_reduction(
     builder: OnnxBuilder, onnx_op: str, value: str, kind: TensorType, axes: Sequence[int], keepdims: bool
 ) -> str:
-    """``value``, of type ``kind``, reduced by ``onnx_op`` over ``axes`` (sorted, counted from the front), in forms that
-    every importer reads.
+    """``value`` reduced by ``onnx_op``, in forms that every importer reads.
 
-    Barracuda 1.4 to 2.3.1 takes the axes of a reduction from its attribute alone and sums over the batch where they are
-    an input, as those of ReduceSum are since opset 13 and of the others since 18 (measured: ReduceSum_10 to _15,
-    ReduceMean_04 of Unity's importers). A sum over the last axis is therefore a product with a column of ones, which
-    onnxruntime computes as fast; over other axes it is the mean times the count.
+    ``value`` is of type ``kind``; ``axes`` are sorted, counted from the front. Barracuda 1.4 to 2.3.1 takes the axes of
+    a reduction from its attribute alone and sums over the batch where they are an input, as those of ReduceSum are
+    since opset 13 and of the others since 18 (measured: ReduceSum_10 to _15, ReduceMean_04 of Unity's importers). A sum
+    over the last axis is therefore a product with a column of ones, which onnxruntime computes as fast; over other axes
+    it is the mean times the count.
     """
     if not axes:
         return value

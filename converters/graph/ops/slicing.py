@@ -202,8 +202,10 @@ def _bounds(step: SliceStep, length: Dim) -> tuple[int, int, int]:
 
 
 def _cut(builder: OnnxBuilder, value: str, cuts: Sequence[_Cut]) -> str:
-    """One Slice for all axes that are not taken whole. An axis taken backwards is a Gather: Barracuda does not step
-    back (Slice_13), and 1.1 misreads an end that is no index (Slice_10), so none is written where a length is known.
+    """One Slice for all axes that are not taken whole.
+
+    An axis taken backwards is a Gather: Barracuda does not step back (Slice_13), and 1.1 misreads an end that is no
+    index (Slice_10), so none is written where a length is known.
     """
     partial = []
     for axis, first, end, stride, length in cuts:

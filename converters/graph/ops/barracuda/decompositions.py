@@ -1,6 +1,7 @@
-"""What a Barracuda or another of Unity's importers lacks or computes otherwise, in ops that all of them have (Barracuda
-1.0 to the Inference Engine): one formula for ``.nn`` and for ONNX. Which importer lacks what stands in
-``consumers/unity/readings.py``.
+"""What a Barracuda or another of Unity's importers lacks or computes otherwise, in ops that all of them have.
+
+They are those of Barracuda 1.0 to the Inference Engine: one formula for ``.nn`` and for ONNX. Which importer lacks what
+stands in ``consumers/unity/readings.py``.
 """
 
 from __future__ import annotations
@@ -154,8 +155,9 @@ def _floor_mod(builder: GraphBuilder, node: Node, types: Mapping[str, TensorType
 
 
 def _cast(builder: GraphBuilder, node: Node, types: Mapping[str, TensorType]) -> Node:
-    """Unity's importers keep the value of a number that is cast (Cast_01 to Cast_03; Sentis and the Inference Engine
-    for bool): its fraction is taken off before a cast to an integer, and a cast to bool is a comparison.
+    """Take the fraction off before a cast to an integer, and compare with zero in place of a cast to bool.
+
+    Unity's importers keep the value of the number (Cast_01 to Cast_03; Sentis and the Inference Engine for bool).
     """
     f, x, target = _Formula(builder, node, types), node.inputs[0], node.attrs["DstT"]
     if target == BOOL and f.dtype != BOOL:

@@ -41,8 +41,9 @@ class LitertBuilder(Protocol):
         """Append an operator with a result of each type."""
 
     def const(self, array: np.ndarray, holds: str = "", axes: Sequence[int] = (), *, own: bool = False) -> Value:
-        """A constant; equal ones share their bytes, and a tensor unless it is to be its ``own``. It may be what
-        ``holds`` names in the graph, with its ``axes`` in another order (numpy's ``transpose``).
+        """A constant; equal ones share their bytes, and a tensor unless it is to be its ``own``.
+
+        It may be what ``holds`` names in the graph, with its ``axes`` in another order (numpy's ``transpose``).
         """
 
     def activated(self, reference: str, function: str) -> Value | None:
