@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import pytest
 
 from converters.compiler.options import CompileOptions
@@ -98,6 +99,19 @@ def test_a_contract_that_is_none_is_refused(text: str, tmp_path: Path) -> None:
     message = mlagents("0.28", continuous=True)
     message.metadata_props.add(key=EMBEDDED, value=text)
     with pytest.raises(DamagedFileError, match="contract"):
+        read_source(save(message, tmp_path))
+
+
+@pytest.mark.parametrize("key", [EMBEDDED, "author"])
+def test_metadata_that_says_something_twice_is_refused_as_onnx_does(key: str, tmp_path: Path) -> None:
+    message = mlagents("0.28", continuous=True)
+    message.metadata_props.add(key=key, value="{}")
+    if key != EMBEDDED:
+        assert read_source(save(message, tmp_path)).policies()
+    message.metadata_props.add(key=key, value="{}")
+    with pytest.raises(onnx.checker.ValidationError, match="duplicate keys in metadata_props"):
+        onnx.checker.check_model(message)
+    with pytest.raises(DamagedFileError, match=f"its metadata has '{key}' twice"):
         read_source(save(message, tmp_path))
 
 

@@ -7,6 +7,7 @@ data is read from the model's own folder only.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -56,7 +57,23 @@ def decode_model(data: bytes | memoryview, detached: Detached | None = None) -> 
             "cannot be decoded as ONNX", why="the file is cut off or damaged", fix="export or download it again"
         ) from error
     _check_texts(model)
+    _check_metadata(model)
     return model
+
+
+def _check_metadata(model: Any) -> None:
+    """Raise DamagedFileError where a key of the metadata, such as the contract's, stands twice; onnx.checker does, too.
+
+    onnxruntime takes the last.
+    """
+    counts = Counter(entry.key for entry in model.metadata_props)
+    for key, count in counts.most_common(1):
+        if count > 1:
+            raise DamagedFileError(
+                f"its metadata has {key[:80]!r} twice",
+                why="readers differ in which of the two they take",
+                fix="export it again, or remove one of them",
+            )
 
 
 def _check_texts(model: Any) -> None:
