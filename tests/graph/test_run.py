@@ -12,6 +12,7 @@ from converters.graph.nodes import Graph, Node
 from converters.graph.ops.linear import matmul
 from converters.graph.ops.table import TABLE
 from converters.graph.run import run_graph
+from exporter.verify.rounding import FACTOR, RUNS
 from signatures.errors import ExportModelError, GraphError
 from tests.graph.harness import Runtimes, policy_of
 from tests.graph.making import const, graph, node, placeholder
@@ -174,6 +175,38 @@ def test_what_rounding_makes_of_a_large_layer_is_computed_without_another_one(tu
         assert tracemalloc.get_traced_memory()[1] < weights.nbytes / 4
     finally:
         tracemalloc.stop()
+
+
+@pytest.mark.parametrize("op", ["Mean", "Sum"])
+@pytest.mark.parametrize(
+    ("axes", "shape"),
+    [
+        ((1, 2, 4), (10, 10, 4, 2)),  # a GroupNorm's, which onnxruntime adds one number after the other
+        ((1, 2), (84, 84, 8)),
+        ((1, 2, 3), (84, 84, 3)),
+        ((1,), (4096,)),
+        ((2, 3), (4, 40, 40)),
+    ],
+    ids=str,
+)
+def test_rounding_explains_what_runtimes_make_of_equal_numbers(
+    op: str, axes: tuple[int, ...], shape: tuple[int, ...], runtimes: Runtimes
+) -> None:
+    """As of a black or white image: a partial sum after the other is rounded the same way."""
+    made = graph(placeholder("x", (None, *shape)), const("axes", axes), node("y", op, "x", "axes", keep_dims=False))
+    numbers = np.random.default_rng(0).uniform(1e3, 1e4, (16, *(1 for _ in shape))).astype(np.float32)
+    feeds = {"x": np.broadcast_to(numbers, (16, *shape)).copy()}
+    exact = run_graph(made, feeds, ["y"])["y"]
+    moved = np.max([np.abs(run_graph(made, feeds, ["y"], Jitter(seed))["y"] - exact) for seed in range(RUNS)], axis=0)
+    answers = (*runtimes.onnx(policy_of(made, ["y"]), feeds, 15), *runtimes.tensorflow(made, feeds, ["y"]))
+    for answer in answers:
+        assert np.all(np.abs(answer - exact) <= FACTOR * moved)
+    # and not by far more: of numbers that differ each is rounded by itself
+    feeds = {"x": np.random.default_rng(1).standard_normal((16, *shape)).astype(np.float32)}
+    exact = run_graph(made, feeds, ["y"])["y"]
+    moved = np.abs(run_graph(made, feeds, ["y"], Jitter(0))["y"] - exact)
+    added = (np.sum if op == "Sum" else np.mean)(np.abs(feeds["x"]), axis=axes)
+    assert np.max(FACTOR * moved / added) < 1e-5
 
 
 @pytest.mark.parametrize("arithmetic", ["processor", "graphics"])

@@ -231,7 +231,7 @@ OPS = (
         "Mean",
         _mean,
         "ReduceMean",
-        "rounded",
+        "summed",
         "MEAN",
         LayerType.REDUCE_MEAN,
         takes="mean",
