@@ -21,7 +21,8 @@ def id_distribution(graph: Graph, types: Types, node: Node) -> dict[str, object]
     """Return what ``distribution`` says of an input that holds ids; None where it holds none, or none that are known.
 
     An id is what picks a row of a table, sets a number of a one-hot, or is compared with 0, 1, 2 …; it may be cast,
-    sliced, shifted and scaled on the way, as the graph itself is asked. Integers that nothing looks up may be any.
+    sliced, shifted and scaled on the way, and counted from the end where it is negative, as the graph itself is asked.
+    Integers that nothing looks up may be any.
     """
     shape = node.dims
     if shape is None:
@@ -110,13 +111,21 @@ def _lookups(graph: Graph, types: Types, node: Node) -> tuple[list[tuple[str, tu
             for place in (i for i, r in enumerate(reader.inputs) if node_of(r) == name):
                 looked = _table(graph, types, reader, place)
                 if looked is not None:
-                    found.append((reader.inputs[place], looked))
+                    found.append((_counted_from_end(graph, reader.inputs[place], looked), looked))
                 elif _looks_up(reader, place):
                     unknown = True
                 elif _by_number(reader) and reader.name not in seen:
                     seen.add(reader.name)
                     stack.append(reader.name)
     return found, unknown
+
+
+def _counted_from_end(graph: Graph, reference: str, looked: tuple[int, int]) -> str:
+    """What a remainder by the length of the table is of: ONNX counts ids below 0 from the end, and refuses others."""
+    maker = graph.producer(reference)
+    length = graph.constant(maker.inputs[1]) if traits(maker).remainder else None
+    wraps = length is not None and length.size == 1 and looked == (0, int(length.reshape(())) - 1)
+    return maker.inputs[0] if wraps else reference
 
 
 def _looks_up(reader: Node, place: int) -> bool:
@@ -141,4 +150,4 @@ def _table(graph: Graph, types: Types, reader: Node, place: int) -> tuple[int, i
 def _by_number(node: Node) -> bool:
     """Whether each number of the result hangs on one number of an operand, or is one."""
     entry = traits(node)
-    return entry.elementwise or bool(entry.moves)
+    return entry.elementwise or bool(entry.moves) or entry.condition is not None

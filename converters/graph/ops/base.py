@@ -151,6 +151,10 @@ class OpDef(_Entry, frozen=True, kw_only=True):
     #: The operand whose integers are looked up, and how many rows there are to find.
     looks_up: int | None = None
     table_size: TableSize | None = None
+    #: The result is the remainder of the first operand by the second.
+    remainder: bool = False
+    #: The operand whose truths choose between the other two, number by number or row by row.
+    condition: int | None = None
     #: The result is where the largest or the smallest number is along an axis.
     chooses: Literal["", "largest", "smallest"] = ""
     #: What the result is of two operands' elements, or of those along an axis.

@@ -358,6 +358,7 @@ BINARY = (
         barracuda=decompositions.FLOOR_MOD,
         loops=simple("mod"),
         litert=builtin("FLOOR_MOD"),
+        remainder=True,
     ),
     _binary(
         "Maximum",

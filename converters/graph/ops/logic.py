@@ -173,6 +173,7 @@ OPS = (
         litert=select,
         loops=loops.select,
         precision="exact",
+        condition=0,
     ),
     OpDef(  # of no policy's graph, but of a TensorFlow.js model's
         "SelectV2",
@@ -185,5 +186,6 @@ OPS = (
         since="1.14",
         precision="exact",
         elementwise=True,
+        condition=0,
     ),
 )
