@@ -53,6 +53,8 @@ class Runtime(Struct, frozen=True):
     taken_by: Literal["auto", "full", "name"] = "auto"
     #: It loads files for a fixed number of agents alone (``--batch``).
     fixed: bool = False
+    #: The dtypes of the tensors that it has; empty: all that its formats have.
+    dtypes: frozenset[str] = frozenset()
     #: It runs in a browser (the word ``browser``).
     browser: bool = False
     #: Its child gives up writing and the network; a browser needs both, and has a sandbox of its own.

@@ -16,8 +16,6 @@ INDEPENDENT = tuple(r.name for r in RUNTIMES if r.independent)
 _ORIGINALS = tuple(r.name for r in RUNTIMES if r.originals)
 #: Runtimes that ``auto`` leaves out: a browser is started only when it is asked for, and js shows little beside others.
 _ON_REQUEST = frozenset(r.name for r in RUNTIMES if r.taken_by != "auto")
-#: Runtimes that load files for a fixed number of agents alone.
-FIXED = frozenset(r.name for r in RUNTIMES if r.fixed)
 #: Runtimes that no word takes.
 _BY_NAME = frozenset(r.name for r in RUNTIMES if r.taken_by == "name")
 _IN_BROWSERS = frozenset(r.name for r in RUNTIMES if r.browser)

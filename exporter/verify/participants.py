@@ -15,7 +15,8 @@ from converters.files.children.process import LoadedModel, RunFailedError
 from converters.formats.registry import FROZEN_GRAPH, WRITTEN
 from converters.formats.source import OriginalRun
 from converters.graph.nodes import Graph
-from converters.runtimes.pool import FIXED, RuntimePool
+from converters.runtimes.pool import RuntimePool
+from converters.runtimes.registry import RUNTIMES
 from exporter.verify.findings import Finding
 from signatures.batches import batches_of, put_together, rows_of
 from signatures.code import CodeOptions
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
 #: The runtime that takes longest to start, by far.
 _SLOWEST = "tensorflow"
+_RUNTIMES = {r.name: r for r in RUNTIMES}
 
 Feeds = Mapping[str, np.ndarray]
 #: (format, runtime, error, the output or "*" for all): what did not run goes here.
@@ -145,7 +147,7 @@ def needed_runtimes(tested: PolicyUnderTest, runtimes: Sequence[str]) -> list[st
     useful = [
         "numpy",
         *source,
-        *(r for kind in tested.artefacts for r in WRITTEN[kind].runtimes if tested.batch or r not in FIXED),
+        *(r for kind in tested.artefacts for r in WRITTEN[kind].runtimes if not unfit_reason(r, tested)),
     ]
     return [r for r in dict.fromkeys(useful) if r == "numpy" or r in runtimes]
 
@@ -163,7 +165,7 @@ def participants_of(
     """
     if reference.original is not None:  # else it would be held against itself
         yield reference.participant("reference", reference.asked, path=tested.reference)
-    pairs = [(kind, r) for kind in tested.artefacts for r in WRITTEN[kind].runtimes if tested.batch or r not in FIXED]
+    pairs = [(kind, r) for kind in tested.artefacts for r in WRITTEN[kind].runtimes if not unfit_reason(r, tested)]
     # A .bytes in numpy is the reference; what runs nowhere else does so there.
     alone = [k for k in tested.artefacts if WRITTEN[k].runtimes == ("numpy",)]
     taking_part = [(k, r) for k, r in pairs if (r in runtimes and r != "numpy") or k in alone]
@@ -191,6 +193,17 @@ def participants_of(
                     # The numpy kernels draw from the seed of the verification, whatever the artefact.
                     again=None if runtime == "numpy" else again,
                 )
+
+
+def unfit_reason(runtime: str, tested: PolicyUnderTest) -> str | None:
+    """Why a runtime can load no file of the policy, whatever the format; None where it can."""
+    info = _RUNTIMES[runtime]
+    if info.fixed and tested.batch is None:
+        return "takes files for a fixed number of agents alone (--batch)"
+    for spec in tested.signature.inputs:
+        if info.dtypes and spec.dtype not in info.dtypes:
+            return f"has no tensors of {spec.dtype}, as the input {spec.name} is"
+    return None
 
 
 def in_order(results: Iterable[Finding], tested: PolicyUnderTest) -> tuple[Finding, ...]:

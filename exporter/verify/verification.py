@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from msgspec.structs import replace
 
 from converters.files.children.process import LoadedModel, RunFailedError
-from converters.runtimes.pool import FIXED, INDEPENDENT
+from converters.runtimes.pool import INDEPENDENT
 from exporter.verify.checks.consumer import consumers
 from exporter.verify.checks.densities import densities
 from exporter.verify.checks.draws import draws
@@ -23,6 +23,7 @@ from exporter.verify.participants import (
     in_order,
     needed_runtimes,
     participants_of,
+    unfit_reason,
 )
 from exporter.verify.reference import Reference
 from exporter.verify.report import ParityReport
@@ -119,11 +120,11 @@ def _report(
     tried = {f.runtime for f in findings}  # one that died has no version any more, but it ran
     states: dict[str, dict[str, str | None]] = {}
     for info in session.known:
-        unfit = info.name in FIXED and tested.batch is None
+        unfit = unfit_reason(info.name, tested)
         ran = info.name in session.runtimes and (info.name in versions or info.name in tried) and not unfit
         reason = None if ran else "not asked for" if info.installed else f"not installed; {info.how}"
         if unfit and info.name in session.runtimes:
-            reason = "takes files for a fixed number of agents alone (--batch)"
+            reason = unfit
         states[info.name] = {
             "version": versions.get(info.name, info.version),
             "status": "ran" if ran else "not run",

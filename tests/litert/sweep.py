@@ -117,6 +117,8 @@ def _web_line(file: Path, pool: RuntimePool) -> dict[str, Any]:
                 assert result.report is not None
                 if result.report.passed is True:
                     record["agree"] += 1
+                elif result.report.runtimes[WEB]["status"] != "ran":
+                    record["refused"] = f"{WEB} {result.report.runtimes[WEB]['reason']}"
                 else:
                     record["failed"].append({"policy": result.policy.name, "why": failure_lines(result.report)[:3]})
         except ExportModelError as error:

@@ -18,6 +18,7 @@ from fixtures import FIXTURES, path
 from tests import known
 from tests.conftest import Chosen
 from tests.litert.sweep import WEB, agents
+from tests.onnx_reader.models import floats, model, node, save
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow, pytest.mark.xdist_group("browser")]
 
@@ -66,6 +67,22 @@ def test_a_bundle_is_verified_again_and_several_agents_are_cut_up(tmp_path: Path
     (result,) = export([path("recurrent")], options, pool=page)
     assert result.report is not None and result.report.passed
     assert verify_bundle(result.folder, runtimes=[WEB]).passed
+
+
+def test_a_policy_that_is_fed_other_dtypes_is_not_given_to_it(tmp_path: Path, page: RuntimePool) -> None:
+    """Four of 449 policies at hand are fed truths or int64, which LiteRT has and LiteRT.js has not."""
+    nodes = [
+        node("Cast", ["flags"], "numbers", to=1),
+        node("MatMul", ["numbers", "w"], "h"),
+        node("Tanh", ["h"], "action"),
+    ]
+    fed, given = {"flags": (np.bool_, ["batch", 4])}, {"action": (np.float32, ["batch", 2])}
+    source = save(model(nodes, fed, given, {"w": floats(4, 2)}), tmp_path)
+    (result,) = export([source], ExportOptions(tmp_path, ("litert",), verify=(WEB, "litert"), batch=1), pool=page)
+    assert result.report is not None
+    assert result.report.passed, "\n".join(failure_lines(result.report))
+    assert {c.runtime for c in result.report.comparisons if c.format == "litert"} == {"litert"}
+    assert result.report.runtimes[WEB]["reason"] == "has no tensors of bool, as the input state is"
 
 
 @pytest.mark.corpus
