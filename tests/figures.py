@@ -289,8 +289,7 @@ def _litert(counted: Mapping[str, Any]) -> list[str]:
     return [
         "## LiteRT",
         "",
-        f"Counted on {counted['date']} by `python -m tests.figures --litert`: {counted['files']} files (public models, "
-        "genuine trainings, other trainers), without those that are not read as a policy.",
+        f"Counted on {counted['date']} by `python -m tests.figures --litert`, on {counted['files']} of these files.",
         "",
         *_table(
             [
@@ -311,8 +310,8 @@ def _litert_web(counted: Mapping[str, Any]) -> list[str]:
     refused = "; ".join(f"{what}: {n}" for what, n in counted["refused"].items()) or "none"
     return [
         f"LiteRT.js in Chromium (`python -m tests.figures --litert-web`, {counted['date']}): {counted['agree']} of "
-        f"{counted['onnx']} agree, {counted['one']} files for one agent, the others, in which classes are drawn, for "
-        f"64. Refused: {refused}. Not in agreement: {', '.join(counted['failed']) or 'none'}.",
+        f"{counted['onnx']} agree, {counted['one']} for one agent, those that draw classes for 64. "
+        f"Refused: {refused}. Not in agreement: {', '.join(counted['failed']) or 'none'}.",
         "",
     ]
 
