@@ -10,9 +10,11 @@ import pytest
 
 from converters.files.children.process import RunFailedError
 from converters.formats.format import Format, WriteOptions
+from converters.formats.programs import plan
 from converters.formats.programs.members import answers
 from converters.formats.registry import WRITTEN
 from converters.graph.nodes import Graph, Node, TensorShape
+from converters.graph.program import program_of
 from converters.graph.types import INT32
 from converters.runtimes.c import compiler
 from converters.runtimes.csharp import tools
@@ -21,8 +23,10 @@ from converters.runtimes.pool import RuntimePool
 from converters.runtimes.registry import available_runtimes
 from exporter.export.pipeline import ExportOptions, export
 from exporter.export.sources import read_source
+from exporter.inspect.inspection import inspect_source
 from exporter.reports.summary import failure_lines
 from fixtures import FIXTURES, path
+from signatures.code import CodeOptions
 from signatures.errors import UnsupportedOpError
 from tests import known
 from tests.conftest import Chosen
@@ -58,6 +62,20 @@ def test_fixtures_agree(name: str, form: Format, tmp_path: Path, processes: Runt
         assert report.passed is True, "\n".join(failure_lines(report))
         compared = {c.output for c in report.comparisons if c.runtime == runtime}
         assert compared >= set(answers(result.policy.signature))
+
+
+def test_a_policy_is_planned_once_for_all_languages(monkeypatch: pytest.MonkeyPatch) -> None:
+    alone = [form.artifact(read_source(path("recurrent")).policies()[0], WriteOptions("{}")) for form in PROGRAMS]
+    planned = []
+    monkeypatch.setattr(plan, "program_of", lambda *given: (planned.append(given), program_of(*given))[1])
+    (found,) = inspect_source(path("recurrent")).policies
+    assert len(planned) == 1
+    beside = [form.artifact(found.policy, WriteOptions("{}")) for form in PROGRAMS]
+    contents = [[{n: p.to_bytes() for n, p in made.files.items()} for made in each] for each in (alone, beside)]
+    assert contents[0] == contents[1] and len(planned) == 1
+    for other in (WriteOptions("[]"), WriteOptions("{}", code=CodeOptions(math="own"))):
+        PROGRAMS[0].artifact(found.policy, other)
+    assert len(planned) == 3
 
 
 @pytest.mark.corpus

@@ -78,7 +78,19 @@ def write_program(
 
 
 def plan_of(policy: Policy, options: WriteOptions) -> Plan:
-    """Plan a policy's program. Raises UnsupportedOpError, UsageError."""
+    """Plan a policy's program, once for the languages that are asked one after the other.
+
+    Raises UnsupportedOpError, UsageError.
+    """
+    said = (policy.name, policy.feeds, policy.fetches, options.contract, options.weights, options.code)
+    kept = policy.graph.cache.get(plan_of)
+    if kept is None or kept[0] is not policy.signature or kept[1] != said:
+        kept = policy.graph.cache[plan_of] = policy.signature, said, _plan(policy, options)
+    plan: Plan = kept[2]
+    return plan
+
+
+def _plan(policy: Policy, options: WriteOptions) -> Plan:
     code = options.code
     header = header_of(policy.name, policy.signature, code)
     fetches = {f.spec.name: policy.fetches[f.spec.name] for f in header.answered}
