@@ -120,7 +120,7 @@ def verify_bundle(
 ) -> ParityReport:
     """Verify a bundle again: ``export_model.verify`` with flat keywords.
 
-    - ``source``: what it was exported from, to compare with that; else its own ``.bytes`` is the reference. ``step``:
+    - ``source``: what it was exported from, to compare with that; else a file of the bundle is the reference. ``step``:
       the checkpoint of the source (default: that of the export).
     - ``runtimes``: ``"auto"``, ``"full"``, ``"browser"``, or runtimes by name; ``options``: seed, samples, tolerances.
     - ``allow_unverified``: no error where no independent runtime is installed.

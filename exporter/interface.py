@@ -177,7 +177,7 @@ def verify(
 ) -> ParityReport:
     """Verify a bundle again: first the hashes of its files, then every format in the installed runtimes.
 
-    - ``source``: what it was exported from, to compare with that; else its own ``.bytes`` is the reference. ``read``:
+    - ``source``: what it was exported from, to compare with that; else a file of the bundle is the reference. ``read``:
       of it, ``step`` and ``trust_source``.
     - ``verify``: as for ``export``.
     - ``allow_unverified``: no error where no independent runtime is installed.

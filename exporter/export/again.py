@@ -23,7 +23,7 @@ from converters.runtimes.pool import RuntimePool, chosen_runtimes
 from exporter.export.job import Job, own_in, runs_elsewhere
 from exporter.export.options import storage_of
 from exporter.export.pipeline import BEFORE_BAKE, UNDER_OWN_NAMES, Progress, consumer, join_reports
-from exporter.export.remade import baked_again, compiled_again, made_again, tensors
+from exporter.export.remade import baked_again, compiled_again, made_again, read_back, tensors
 from exporter.export.sources import Source, read_source
 from exporter.verify.checks.decisions import decisions
 from exporter.verify.options import VerifyOptions
@@ -31,6 +31,7 @@ from exporter.verify.participants import policy_under_test, write_reference
 from exporter.verify.plays import read_plays
 from exporter.verify.report import ParityReport
 from exporter.verify.session import Session
+from exporter.verify.verdict import reference_text
 from exporter.verify.verification import verify
 from signatures.code import CodeOptions
 from signatures.contract import POLICY, Contract
@@ -90,9 +91,9 @@ def verify_folder(
 ) -> ParityReport:
     """Verify a bundle again: hashes first, then every format in the runtimes.
 
-    Without ``source`` the reference is the bundle's own ``.bytes``, without that its ``.nn``. Raises BundleError, and
-    RuntimeUnavailableError when no independent runtime ran (unless ``allow_unverified``, or there is only a ``.nn``,
-    which no runtime outside Unity has).
+    Without ``source`` the reference is the bundle's own ``.bytes``, without that its ``.nn``, without that the first
+    other file that is read back. Raises BundleError, and RuntimeUnavailableError when no independent runtime ran
+    (unless ``allow_unverified``, or there is only a ``.nn``, which no runtime outside Unity has).
     """
     if step is not None and source is None:
         raise UsageError(f"--step {step} goes with --source", fix="give the folder of the run: --source FOLDER")
@@ -111,6 +112,10 @@ def verify_folder(
         assert form.held is not None
         with naming(found.path(form)):
             found.verify_contract(form.held(found.path(form)))
+    own = case.judge or FROZEN_GRAPH
+    if case.judge is None and case.made_for is None and given.again is None:
+        again, own = read_back(found)
+        given = replace(given, again=again)
     report = _run(case, given, runtimes, options, progress)
     if case.programs:
         report = _with_note(
@@ -125,9 +130,8 @@ def verify_folder(
             "compared when it was exported, and are again with --source FILE",
         )
     if source is None:
-        own = (case.judge or FROZEN_GRAPH).key
-        report = replace(report, reference=f"{own}/{KERNELS}", self_consistent=False)
-        report = _with_note(report, f"the source was not given: the reference is the bundle's own .{own}")
+        report = replace(report, reference=f"{own.key}/{KERNELS}", self_consistent=False)
+        report = _with_note(report, f"the source was not given: the reference is {reference_text(report)}")
     report = replace(report, played=read_plays(folder))
     return _unless_unverified(report, case, required=not (allow_unverified or runtimes == "none"))
 
@@ -170,7 +174,12 @@ def _evidence_of(found: Bundle, read: Source) -> _Given:
         original = _original_of(read, contract)
         _check_meaning(read, contract, found.folder)
         judged = own_reference([f.key for f in WRITTEN.values() if found.has(f)])
-        return _Given(read, original, compiled_again(read, contract) if judged is None else None)
+        try:
+            return _Given(read, original, compiled_again(read, contract) if judged is None else None)
+        except BundleError:  # it was exported with options that no contract keeps
+            if original is None:
+                raise
+            return _Given(read, original)
     wanted = consumer(made_for)
     if wanted.own_names.isdisjoint(f.key for f in WRITTEN.values() if found.has(f)):
         # Names of a consumer are not those of the source: what it was made from is dressed anew, and held against it.

@@ -9,13 +9,17 @@ from typing import TYPE_CHECKING, get_args
 from msgspec.structs import replace
 
 from converters.compiler.options import CompileOptions, NoiseMode
-from converters.formats.source import SourceModel
+from converters.formats.bundle.bundle import Bundle, unfit
+from converters.formats.format import Format
+from converters.formats.registry import WRITTEN
+from converters.formats.source import ReadOptions, SourceModel
 from converters.interfaces.isaac_lab import RAW_ACTION
+from converters.interfaces.registry import NO_INTERFACE
 from converters.policy.policy import Policy
 from exporter.export.job import Job, bake, smaller
 from exporter.export.options import storage_of
-from exporter.export.sources import Source
-from signatures.contract import Contract, safe_name
+from exporter.export.sources import Source, read_source
+from signatures.contract import POLICY, Contract, safe_name
 from signatures.errors import BundleError
 from signatures.interface import Quantity
 from signatures.spec import PolicySignature, SourceMap
@@ -59,6 +63,31 @@ def compiled_again(found: Source, contract: Contract) -> Job:
         if _alike(own, contract):
             return _round_like(Job(found, model, replace(own, name=contract.name)), contract)
     raise _not_like_its_source(found, "export it again with bytes among --to")
+
+
+def read_back(found: Bundle) -> tuple[Job, Format]:
+    """The policy of a bundle that has no file which the kernels run, read from the first of its files that is a source.
+
+    Raises BundleError where none is, or where it is read as another policy than policy.json says.
+    """
+    form = next((f for f in WRITTEN.values() if f.read is not None and found.has(f)), None)
+    if form is None:
+        held = ", ".join(f.key for f in WRITTEN.values() if found.has(f))
+        raise BundleError(
+            f"has no file that is read back: only {held}",
+            where=str(found.folder),
+            why="source code is compiled and run, and a reference is what export-model reads by itself",
+            fix=f"give what it was made from: --source {found.contract.origin.path}; or export the policy again, with "
+            "bytes among --to",
+        )
+    source = read_source(found.path(form), ReadOptions(interface=NO_INTERFACE))
+    wanted = tensors(found.signature)
+    for model, own in _candidates(source, found.contract):
+        if tensors(own.signature) == wanted:
+            return Job(source, model, replace(own, name=found.name)), form
+    raise unfit(
+        found.path(form), f"is read as another policy than {POLICY} says", "its inputs and outputs are not those there"
+    )
 
 
 def _candidates(found: Source, contract: Contract) -> Iterator[tuple[SourceModel, Policy]]:

@@ -93,7 +93,7 @@ def reference_text(report: ParityReport) -> str:
     if report.original is not None:
         return f"the original in {runtime_title(report.original)}"
     if "/" in report.reference:
-        return f"the bundle's own .{report.reference.partition('/')[0]}"
+        return f"the bundle's own {WRITTEN[report.reference.partition('/')[0]].main_of('')}"
     if report.self_consistent:
         return "export-model's reading of the original, which nothing else here can run"
     return "export-model's reading of the original, which was not run"

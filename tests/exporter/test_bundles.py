@@ -415,9 +415,9 @@ def test_a_format_that_the_contract_does_not_name_is_not_run(ball: Path) -> None
     assert "onnx" not in ran.json["reports"][0]["sizes"]
 
 
-def test_a_bundle_without_bytes_has_no_reference(tmp_path: Path) -> None:
-    export_model(fixture("continuous"), "-o", tmp_path, "--verify", "none", "--to", "onnx")
-    is_no_bundle(tmp_path / "continuous", "has no .bytes", "--to")
+def test_a_bundle_of_source_code_alone_has_no_reference(tmp_path: Path) -> None:
+    export_model(fixture("continuous"), "-o", tmp_path, "--verify", "none", "--to", "c,js")
+    is_no_bundle(tmp_path / "continuous", "has no file that is read back: only c, js", "--to")
 
 
 def test_another_source_is_refused(ball: Path) -> None:

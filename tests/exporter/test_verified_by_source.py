@@ -1,4 +1,5 @@
-"""``verify --source`` of bundles without ``.bytes``: the reference is the source, compiled once more as for the export.
+"""``verify`` of bundles without ``.bytes``: the reference is the source, compiled once more as for the export, or
+without it another file of the bundle, read back.
 
 onnxruntime and the source's own answers are the judges.
 """
@@ -37,7 +38,10 @@ CASES = [
     ("continuous", ("--for", "unity6", "--noise", "zero")),
     ("recurrent", ("--for", "unity6", "--deterministic")),
     ("continuous", ("--for", "isaac-lab")),
+    ("continuous", ("--set", "epsilon=0")),
+    ("continuous", ("--input", "epsilon=parameter")),
 ]
+ALONE = [(policy, options) for policy, options in CASES if "--for" not in options]
 
 
 def exported(policy: str, options: tuple[str, ...], out: Path, formats: str = "onnx") -> Path:
@@ -55,9 +59,33 @@ def test_a_bundle_without_bytes_agrees_with_its_source(policy: str, options: tup
     assert {c["runtime"] for c in report["comparisons"] if c["format"] == "onnx"} >= {"onnxruntime"}
 
 
+@pytest.mark.parametrize(("policy", "options"), ALONE, ids=lambda v: v if isinstance(v, str) else " ".join(v))
+@pytest.mark.parametrize("formats", ["onnx", "tfjs,onnx", "saved_model,onnx", "litert,onnx"])
+def test_without_both_a_file_of_the_bundle_is_the_reference(
+    policy: str, options: tuple[str, ...], formats: str, tmp_path: Path
+) -> None:
+    ran = export_model("verify", exported(policy, options, tmp_path, formats), *RUN)
+    assert ran.status == 0, ran
+    (report,) = ran.json["reports"]
+    assert report["reference"] == f"{formats.removeprefix('litert,').split(',')[0]}/numpy"
+    assert {c["runtime"] for c in report["comparisons"] if c["format"] == "onnx"} >= {"onnxruntime"}
+
+
 @pytest.mark.parametrize("options", [(), ("--deterministic",), ("--for", "unity6", "--deterministic")])
 def test_a_changed_weight_is_told(options: tuple[str, ...], tmp_path: Path) -> None:
     folder = exported("continuous", options, tmp_path)
+    change_a_weight(folder)
+    assert export_model("verify", folder, "--source", fixture("continuous"), *RUN).status == 1
+
+
+def test_a_weight_that_one_file_alone_has_is_told_without_the_source(tmp_path: Path) -> None:
+    folder = exported("continuous", (), tmp_path, "tfjs,onnx")
+    change_a_weight(folder)
+    ran = export_model("verify", folder, "--runtimes", "numpy,onnxruntime")
+    assert ran.status == 1 and "disagree with the bundle's own tfjs" in ran.out
+
+
+def change_a_weight(folder: Path) -> None:
     file = folder / "continuous.onnx"
     model = onnx.load(file)
     weights = max(model.graph.initializer, key=lambda t: np.prod(t.dims))
@@ -70,7 +98,6 @@ def test_a_changed_weight_is_told(options: tuple[str, ...], tmp_path: Path) -> N
         "bytes": file.stat().st_size,
     }
     (folder / "policy.json").write_text(json.dumps(contract))
-    assert export_model("verify", folder, "--source", fixture("continuous"), *RUN).status == 1
 
 
 @pytest.mark.parametrize("formats", ["onnx", "onnx,bytes"])
@@ -85,8 +112,8 @@ def test_a_baked_action_of_rounded_weights_agrees(formats: str, tmp_path: Path) 
 
 
 def test_the_error_names_the_source_that_would_do(tmp_path: Path) -> None:
-    folder = exported("continuous", (), tmp_path)
-    is_refused(export_model("verify", folder), "has no .bytes", "--source continuous.bytes")
+    folder = exported("continuous", (), tmp_path, "c")
+    is_refused(export_model("verify", folder), "only c", "--source continuous.bytes")
 
 
 @pytest.mark.parametrize("formats", ["onnx", "onnx,bytes"])
