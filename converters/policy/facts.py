@@ -27,6 +27,8 @@ class SourceFacts(Struct, frozen=True):
     - ``constants``: the ones that are no nodes of the graph.
     - ``distributions``: placeholder → what it is fed, where the format says it.
     - ``bounds``: placeholder → the lowest and highest integer of the source's own dtype, where it was widened.
+    - ``from_end``: ids below 0 are counted from the end of their table, and those beyond it refused, as ONNX says; the
+      reader looks up the remainder by the table's length.
     - ``outputs``: the nodes that the format declares as outputs, with their roles where it says them; empty: it
       declares none, and any node may be an output.
     - ``rows``: the only number of rows that the source takes, or gets right; None: any.
@@ -48,6 +50,7 @@ class SourceFacts(Struct, frozen=True):
     constants: Mapping[str, Constant] = field(default_factory=dict)
     distributions: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     bounds: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+    from_end: bool = False
     outputs: Mapping[str, Role | None] = field(default_factory=dict)
     rows: int | None = None
     notes: tuple[str, ...] = ()

@@ -17,12 +17,13 @@ _FREE_AXIS = 8
 _MOST_COLUMNS = 1 << 14
 
 
-def id_distribution(graph: Graph, types: Types, node: Node) -> dict[str, object] | None:
+def id_distribution(graph: Graph, types: Types, node: Node, *, from_end: bool = False) -> dict[str, object] | None:
     """Return what ``distribution`` says of an input that holds ids; None where it holds none, or none that are known.
 
     An id is what picks a row of a table, sets a number of a one-hot, or is compared with 0, 1, 2 …; it may be cast,
     sliced, shifted and scaled on the way, and counted from the end where it is negative, as the graph itself is asked.
-    Integers that nothing looks up may be any.
+    ``from_end``: the remainder by a table's length that is looked up is the reader's (``SourceFacts``). Integers that
+    nothing looks up may be any.
     """
     shape = node.dims
     if shape is None:
@@ -33,6 +34,8 @@ def id_distribution(graph: Graph, types: Types, node: Node) -> dict[str, object]
         return None
     whole = node.attrs["dtype"].kind in "iu"
     lookups, unknown = _lookups(graph, types, node)
+    if from_end:
+        lookups = [(_before_remainder(graph, reference, looked), looked) for reference, looked in lookups]
     if unknown and whole:
         return None
     low, high = np.full(count, -np.inf), np.full(count, np.inf)
@@ -111,7 +114,7 @@ def _lookups(graph: Graph, types: Types, node: Node) -> tuple[list[tuple[str, tu
             for place in (i for i, r in enumerate(reader.inputs) if node_of(r) == name):
                 looked = _table(graph, types, reader, place)
                 if looked is not None:
-                    found.append((_counted_from_end(graph, reader.inputs[place], looked), looked))
+                    found.append((reader.inputs[place], looked))
                 elif _looks_up(reader, place):
                     unknown = True
                 elif _by_number(reader) and reader.name not in seen:
@@ -120,8 +123,8 @@ def _lookups(graph: Graph, types: Types, node: Node) -> tuple[list[tuple[str, tu
     return found, unknown
 
 
-def _counted_from_end(graph: Graph, reference: str, looked: tuple[int, int]) -> str:
-    """What a remainder by the length of the table is of: ONNX counts ids below 0 from the end, and refuses others."""
+def _before_remainder(graph: Graph, reference: str, looked: tuple[int, int]) -> str:
+    """What a remainder by the length of the table is of; any other tensor itself."""
     maker = graph.producer(reference)
     length = graph.constant(maker.inputs[1]) if traits(maker).remainder else None
     wraps = length is not None and length.size == 1 and looked == (0, int(length.reshape(())) - 1)

@@ -18,6 +18,7 @@ from converters.graph.types import static_shape
 from converters.interfaces.fit import fit_interface, name_numbers
 from converters.policy.action import ActionMeaning, action_meaning
 from converters.policy.brains import Head
+from converters.policy.facts import SourceFacts
 from converters.policy.generations import generation
 from converters.policy.identifiers import id_distribution
 from converters.policy.memories import memory_layout
@@ -284,7 +285,7 @@ def _inputs(compiled: Compilation, types: Types, notes: list[str]) -> tuple[dict
             )
         feeds[name] = node.name
         facts = compiled.facts
-        distribution = facts.distributions.get(node.name) or _distribution(graph, types, node, role)
+        distribution = facts.distributions.get(node.name) or _distribution(graph, types, node, role, facts)
         if node.name in facts.bounds:
             distribution = _within(distribution, facts.bounds[node.name])
         specs.append(TensorSpec(name, role, node.attrs["dtype"].name, _known_shape(node), node.origin, distribution))
@@ -310,7 +311,7 @@ def _trailing_number(name: str) -> int:
     return int(digits) if digits else -1
 
 
-def _distribution(graph: Graph, types: Types, node: Node, role: Role) -> dict[str, object] | None:
+def _distribution(graph: Graph, types: Types, node: Node, role: Role, facts: SourceFacts) -> dict[str, object] | None:
     if role is Role.NOISE:
         return {"kind": "normal", "mean": 0.0, "std": 1.0}
     if role is Role.MASKS:
@@ -319,7 +320,7 @@ def _distribution(graph: Graph, types: Types, node: Node, role: Role) -> dict[st
         return {"kind": "uniform", "low": 0.0, "high": float(highest_colour(graph, node.name))}
     if role in (Role.VECTOR, Role.ENTITIES):
         normal = normaliser(graph, node.name) if role is Role.VECTOR else None
-        return normal or id_distribution(graph, types, node)
+        return normal or id_distribution(graph, types, node, from_end=facts.from_end)
     return None
 
 

@@ -48,6 +48,7 @@ def understand(model: OnnxModel) -> tuple[Graph, SourceFacts]:
     facts = SourceFacts(
         image_layout=_image_layout(model),
         rows=rows,
+        from_end=True,
         outputs=dict.fromkeys(model.outputs.values()),
         memories=model.memories or None,
         model_name=model.name,
