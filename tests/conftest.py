@@ -41,13 +41,14 @@ SLOW = (HealthCheck.too_slow,)
 settings.register_profile("busy", deadline=None, derandomize=ANEW not in os.environ, suppress_health_check=SLOW)
 settings.load_profile("busy")
 
-#: Rooms whose tests start runtimes, browsers, servers or the program; and what tests of other rooms then ask for.
+#: Rooms whose tests start runtimes, compilers, browsers, servers or the program.
 _ROOMS = frozenset(
     (
-        *("acting", "bench", "browser", "chains", "corpus", "docs", "faults", "fleet", "fuzz", "install", "legacy"),
-        *("live", "peers", "runtimes", "serve", "trained"),
+        *("acting", "bench", "browser", "c", "chains", "corpus", "docs", "faults", "fleet", "fuzz", "install"),
+        *("legacy", "live", "peers", "programs", "runtimes", "serve", "trained"),
     )
 )
+#: What tests of other rooms ask for then.
 _FIXTURE = "processes"
 
 

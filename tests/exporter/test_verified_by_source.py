@@ -20,6 +20,7 @@ from fixtures import path as fixture
 from tests.commands import export_model, is_refused
 
 pytest.importorskip("onnxruntime")
+pytestmark = pytest.mark.runtimes
 RUN = ("--runtimes", "numpy,onnxruntime", "--json")
 #: policy, options of its export
 CASES = [

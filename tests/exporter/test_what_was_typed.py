@@ -15,7 +15,7 @@ from tests.commands import export_model
 #: What each command needs beside its options; others need a bundle, or take long.
 GIVEN = {
     "export": [str(fixture("continuous")), "--verify", "none", "--to", "onnx"],
-    "compare": [str(fixture("continuous")), str(fixture("continuous"))],
+    "compare": [str(fixture("continuous")), str(fixture("continuous")), "--verify", "numpy", "--allow-unverified"],
     "inspect": [str(fixture("continuous"))],
     "runtimes": [],
     "consumers": [],
