@@ -19,9 +19,14 @@ os.environ.update(TF_CPP_MIN_LOG_LEVEL="3", TF_ENABLE_ONEDNN_OPTS="0", CUDA_VISI
 import keras
 from keras import layers as k
 
+from tests.keras_reader.operation_models import OPERATIONS
+
 RANDOM = np.random.default_rng(11)
 #: Models that are written as HDF5 too: one of each way in which weights are named.
-OLDER = ("dense", "mobile", "lstm over a history", "attention", "nested", "shared", "bidirectional lstm")
+OLDER = (
+    *("dense", "mobile", "lstm over a history", "attention", "nested", "shared", "bidirectional lstm"),
+    "operations on an image",
+)
 Model = Callable[[], Any]
 
 
@@ -40,11 +45,11 @@ def joined(layer: Any, *shapes: Sequence[int]) -> Model:
     return make
 
 
-def of_one(shape: Sequence[int], function: Callable[[Any], Any]) -> Model:
+def of_one(shape: Sequence[int], function: Callable[[Any], Any], dtype: str = "float32") -> Model:
     """A functional model of one input."""
 
     def make() -> Any:
-        x = keras.Input(shape, name="observation")
+        x = keras.Input(shape, name="observation", dtype=dtype)
         return keras.Model(x, function(x))
 
     return make
@@ -95,7 +100,7 @@ def told(x: Any) -> Any:
 NAMES = (
     *("relu", "relu6", "sigmoid", "tanh", "elu", "selu", "celu", "softplus", "softsign", "exponential", "silu", "mish"),
     *("gelu", "leaky_relu", "hard_sigmoid", "hard_silu", "hard_tanh", "softmax", "log_softmax", "log_sigmoid"),
-    *("squareplus", "tanh_shrink", "hard_shrink", "soft_shrink", "linear"),
+    *("squareplus", "tanh_shrink", "hard_shrink", "soft_shrink", "sparse_plus", "sparse_sigmoid", "linear"),
 )
 FIRST = {"data_format": "channels_first"}
 MODELS: dict[str, Model] = {
@@ -220,6 +225,7 @@ MODELS: dict[str, Model] = {
     "nested": of_one([6], nested),
     "shared": of_one([6], shared),
     "operations": of_one([6], operations),
+    **{name: of_one(shape, function, dtype) for name, (shape, dtype, function) in OPERATIONS.items()},
 }
 
 
@@ -243,7 +249,9 @@ def main(folder: Path) -> None:
         fed = []
         for tensor in model.inputs:
             values = RANDOM.uniform(-2, 2, (3, *tensor.shape[1:]))
-            fed.append(np.abs(values * 2).astype(tensor.dtype) if "int" in tensor.dtype else values.astype("float32"))
+            scale = 64 if tensor.dtype == "uint8" else 2
+            whole = "int" in tensor.dtype
+            fed.append(np.abs(values * scale).astype(tensor.dtype) if whole else values.astype("float32"))
         given = model(fed if len(fed) > 1 else fed[0], training=False)
         given = given if isinstance(given, list | tuple) else [given]
         model.save(folder / f"{name}.keras")

@@ -172,6 +172,8 @@ def _value(value: Any) -> Any:
             return _place(value["config"]["keras_history"])
         if kind == "__slice__":
             return slice(*(value["config"][k] for k in ("start", "stop", "step")))
+        if kind == "__ellipsis__":
+            return Ellipsis
         if kind in ("__tuple__", "__numpy__", "__tensor__"):
             content = value["config"]
             return _value(content["value"] if isinstance(content, Mapping) else content)

@@ -26,6 +26,13 @@ def _squareplus(b: Builder, x: str) -> str:
     return nn.scale_and_shift(b, b.add("Add", [x, root]), 0.5)
 
 
+def _sparse_plus(b: Builder, x: str) -> str:
+    """(x + 1)²/4 between −1 and 1, where it leaves 0 and meets x."""
+    bend = b.add("Square", [b.add("Add", [nn.clip(b, x, -1, 1), b.number(x, 1)])])
+    above = b.add("Relu", [b.add("Sub", [x, b.number(x, 1)])])
+    return b.add("Add", [nn.scale_and_shift(b, bend, 0.25), above])
+
+
 def _outside(b: Builder, x: str, inside: Callable[[str], str]) -> str:
     """X where |x| is above a half, as ``inside`` says there; else 0."""
     far = b.add("Greater", [b.add("Abs", [x]), b.number(x, 0.5)])
@@ -54,6 +61,8 @@ _ACTIVATIONS: Mapping[str, Activation] = {
     "log_softmax": _softmax("LogSoftmax"),
     "log_sigmoid": nn.log_sigmoid,
     "squareplus": _squareplus,
+    "sparse_plus": _sparse_plus,
+    "sparse_sigmoid": lambda b, x: nn.hard_sigmoid(b, x, 0.5, 0.5),
     "tanh_shrink": lambda b, x: b.add("Sub", [x, b.add("Tanh", [x])]),
     "hard_shrink": lambda b, x: _outside(b, x, lambda inner: inner),
     "soft_shrink": lambda b, x: b.add("Sub", [x, nn.clip(b, x, -0.5, 0.5)]),
