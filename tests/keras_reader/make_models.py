@@ -25,7 +25,7 @@ RANDOM = np.random.default_rng(11)
 #: Models that are written as HDF5 too: one of each way in which weights are named.
 OLDER = (
     *("dense", "mobile", "lstm over a history", "attention", "nested", "shared", "bidirectional lstm"),
-    "operations on an image",
+    *("operations on an image", "spectral", "grouped queries"),
 )
 Model = Callable[[], Any]
 
@@ -222,6 +222,40 @@ MODELS: dict[str, Model] = {
     "attention to later steps": of_one([5, 6], masked),
     "attention, shares told": of_one([5, 6], told),
     "dot-product attention": of_one([4, 6], lambda x: k.Attention(use_scale=True)([x, k.Dense(6)(x)])),
+    "additive attention": of_one(
+        [4, 6],
+        lambda x: [
+            *(k.AdditiveAttention()([x, k.Dense(6)(x)[:, 1:]]), k.AdditiveAttention(use_scale=False)([x, x, x * 2])),
+            *k.AdditiveAttention()([x, x], return_attention_scores=True, use_causal_mask=True),
+        ],
+    ),
+    "grouped queries": of_one(
+        [4, 6],
+        lambda x: [
+            k.GroupQueryAttention(4, 6, 2)(x, k.Dense(6)(x)[:, 1:]),
+            *k.GroupQueryAttention(3, 3, 1, use_bias=False)(x, x, use_causal_mask=True, return_attention_scores=True),
+        ],
+    ),
+    "spectral": chain(
+        [6, 5, 1],
+        *(k.SpectralNormalization(k.Conv2D(3, 2, activation="relu")), k.Flatten()),
+        *(k.SpectralNormalization(k.Dense(1, use_bias=False)), k.SpectralNormalization(k.Dense(4)), k.Dense(2)),
+    ),
+    "categories": of_one(
+        [3],
+        lambda x: [
+            *(k.CategoryEncoding(8)(x), k.CategoryEncoding(8, output_mode="one_hot")(x)),
+            *(k.CategoryEncoding(8, output_mode="count")(x), k.CategoryEncoding(4, output_mode="one_hot")(x[:, :1])),
+        ],
+        "int32",
+    ),
+    "bins": of_one(
+        [3],
+        lambda x: [
+            k.Discretization([-1.0, 0.0, 0.5])(x),
+            *(k.Discretization([-1.0, 0.0, 0.5], output_mode=mode)(x) for mode in ("one_hot", "multi_hot", "count")),
+        ],
+    ),
     "nested": of_one([6], nested),
     "shared": of_one([6], shared),
     "operations": of_one([6], operations),

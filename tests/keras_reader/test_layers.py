@@ -22,6 +22,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("keras_reader")]
 NOT_MET = {
     "SyncBatchNormalization": "BatchNormalization under its name in Keras 2",
     "ThresholdedReLU": "gone from Keras 3",
+    "GroupedQueryAttention": "GroupQueryAttention in a configuration",
 }
 #: Operations under a second name, which another release writes.
 OTHER_SPELLINGS = {"Abs", "Amax", "Amin"}

@@ -18,6 +18,8 @@ from signatures.errors import DamagedFileError, NotAPolicyError
 
 #: Classes that are models themselves.
 MODELS = frozenset(("Functional", "Model", "Sequential"))
+#: Classes that a configuration calls by the name that Keras exports; weights lie under their own.
+_EXPORTED = {"GroupQueryAttention": "GroupedQueryAttention"}
 
 
 class Place(Struct, frozen=True):
@@ -69,6 +71,7 @@ def model_of(config: Any) -> LayeredModel:
 def layer_of(entry: Mapping[str, Any]) -> Layer:
     """One layer of a configuration."""
     kind, config = _text(entry["class_name"]), entry["config"]
+    kind = _EXPORTED.get(kind, kind)
     module = str(entry.get("module") or "")
     if kind in MODELS:
         name = _text(config["name"] if isinstance(config, Mapping) else entry.get("name", kind.lower()))
