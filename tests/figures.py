@@ -176,6 +176,19 @@ def _table(head: Sequence[object], rows: Iterable[Sequence[object]]) -> list[str
     return [_row(head), "|" + "---|" * len(head), *map(_row, rows), ""]
 
 
+def _joined(rows: Iterable[Sequence[object]], column: int) -> list[list[object]]:
+    """Rows that differ in one column alone as one row, with all that they have there."""
+    found: dict[tuple[object, ...], list[str]] = {}
+    for row in rows:
+        found.setdefault((*row[:column], *row[column + 1 :]), []).append(str(row[column]))
+    return [[*rest[:column], ", ".join(names), *rest[column:]] for rest, names in found.items()]
+
+
+def _by_runtime(rows: Iterable[Sequence[object]]) -> list[list[object]]:
+    """Rows that begin with a format and a runtime, those that say the same as one."""
+    return _joined(_joined(rows, 1), 0)
+
+
 def counted(content: Mapping[str, Any]) -> tuple[int, int]:
     """Return (comparisons, failures) in independent runtimes, which the front page quotes."""
     cells = [c for c in content["cells"] if c["runtime"] in INDEPENDENT]
@@ -214,7 +227,7 @@ def page(content: Mapping[str, Any]) -> str:
         "",
         *_table(
             ["format", "runtime", *(f"{KINDS[k]} ({content['kinds'][k]})" for k in kinds)],
-            [[f, r, *(_worst(cells.get((k, f, r))) for k in kinds)] for f, r in rows],
+            _by_runtime([f, r, *(_worst(cells.get((k, f, r))) for k in kinds)] for f, r in rows),
         ),
         *(
             ["Not in the table, as they have a tolerance of their own: " + "; ".join(own) + ".", ""]
@@ -228,7 +241,7 @@ def page(content: Mapping[str, Any]) -> str:
         "",
         *_table(
             ["format", "runtime", "elements", "equal", "below 1e-6", "below 1e-5", "above", "by rounding"],
-            [[f, r, *_spread([cells[k, f, r] for k in kinds if (k, f, r) in cells])] for f, r in rows],
+            _by_runtime([f, r, *_spread([cells[k, f, r] for k in kinds if (k, f, r) in cells])] for f, r in rows),
         ),
         "## Draws",
         "",
@@ -267,16 +280,19 @@ def _profiles(counted: Mapping[str, Any]) -> list[str]:
         "",
         *_table(
             ["`--for`", "format", "held", "refused", "why"],
-            [
+            _joined(
                 [
-                    f"`{c['profile']}`",
-                    c["format"],
-                    c["held"],
-                    sum(c["refused"].values()),
-                    "; ".join(f"{why}: {n}" for why, n in c["refused"].items()),
-                ]
-                for c in counted["profiles"]
-            ],
+                    [
+                        f"`{c['profile']}`",
+                        c["format"],
+                        c["held"],
+                        sum(c["refused"].values()),
+                        "; ".join(f"{why}: {n}" for why, n in c["refused"].items()),
+                    ]
+                    for c in counted["profiles"]
+                ],
+                0,
+            ),
         ),
         "Not read: " + "; ".join(f"{why}: {n}" for why, n in counted["unread"].items()) + ".",
         "",
