@@ -10,16 +10,56 @@ from msgspec.structs import replace
 from converters.consumers.mlagents.version2 import dress_nn
 from converters.formats.barracuda.format import NnModel
 from converters.formats.barracuda.lower import policy_model
+from converters.graph.nodes import Graph, TensorShape
+from converters.graph.run import run_graph
 from converters.policy.policy import Policy
 from signatures.roles import ACTION_NAMES, Role
-from signatures.spec import TensorSpec
+from signatures.spec import PolicySignature, TensorSpec
 from tests.barracuda.reference import evaluate
+from tests.graph.samples import Sample
 
 Array = np.ndarray
 Arrays = Mapping[str, Array]
 
 _PLAIN = {Role.MASKS: "action_masks", Role.PREV_ACTION: "prev_action", Role.NOISE: "epsilon"}
 _RANDOM_NORMAL = 64
+
+
+def as_policy(sample: Sample) -> Policy | None:
+    """A sample's graph as a policy; None where it is none: a batch is missing, or an input has no fixed width.
+
+    Its inputs are vectors and images; its results, flattened, are the action.
+    """
+    specs = []
+    nodes = []
+    for node in sample.graph.nodes:
+        if node.op != "Placeholder":
+            nodes.append(node)
+            continue
+        array = sample.feeds[node.name]
+        dims: TensorShape = node.attrs["shape"]
+        if dims.dims is None or not dims.dims or dims.dims[0] is not None or None in dims.dims[1:] or array.ndim > 4:
+            return None
+        role = Role.VISUAL if array.ndim == 4 else Role.VECTOR
+        specs.append(TensorSpec(node.name, role, array.dtype.name, dims.dims))
+        nodes.append(node)
+    if not specs:
+        return None
+    types = run_graph(sample.graph, sample.feeds, sample.fetches)
+    outputs, fetches = [], {}
+    for number, name in enumerate(sample.fetches):
+        array = types[name]
+        if array.ndim == 0 or len(array) != len(next(iter(sample.feeds.values()))):
+            return None
+        output = "action" if number == 0 else f"extra_{number}"
+        outputs.append(
+            TensorSpec(
+                output, Role.CONTINUOUS if number == 0 else Role.OTHER, array.dtype.name, (None, *array.shape[1:])
+            )
+        )
+        fetches[output] = name
+    signature = PolicySignature(inputs=tuple(specs), outputs=tuple(outputs), family="test", action_space="continuous")
+    return Policy("sample", Graph(tuple(nodes)), signature, {s.name: s.name for s in specs}, fetches)
 
 
 def fed(policy: Policy, model: NnModel, feeds: Arrays) -> dict[str, Array]:

@@ -7,60 +7,20 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from converters.graph.nodes import Graph, TensorShape
 from converters.graph.ops.table import TABLE
 from converters.graph.run import run_graph
-from converters.policy.policy import Policy
 from signatures.errors import UnsupportedOpError
 from signatures.roles import Role
-from signatures.spec import PolicySignature, TensorSpec
 from tests.barracuda.cases import Case, all_cases
-from tests.barracuda.nn_running import action_model, action_of, some
+from tests.barracuda.nn_running import action_model, action_of, as_policy, some
 from tests.barracuda.nn_safety import assert_safe
 from tests.barracuda.test_layers import feeds_of, policy_of
-from tests.graph.samples import SAMPLES, Sample
+from tests.graph.samples import SAMPLES
 
 CLOSE = {"atol": 3e-5, "rtol": 3e-5}
 
 
 # ------------------------------------------------------------------ the table of ops
-
-
-def as_policy(sample: Sample) -> Policy | None:
-    """A sample's graph as a policy; None where it is none: a batch is missing, or an input has no fixed width.
-
-    Its inputs are vectors and images; its results, flattened, are the action.
-    """
-    specs = []
-    nodes = []
-    for node in sample.graph.nodes:
-        if node.op != "Placeholder":
-            nodes.append(node)
-            continue
-        array = sample.feeds[node.name]
-        dims: TensorShape = node.attrs["shape"]
-        if dims.dims is None or not dims.dims or dims.dims[0] is not None or None in dims.dims[1:] or array.ndim > 4:
-            return None
-        role = Role.VISUAL if array.ndim == 4 else Role.VECTOR
-        specs.append(TensorSpec(node.name, role, array.dtype.name, dims.dims))
-        nodes.append(node)
-    if not specs:
-        return None
-    types = run_graph(sample.graph, sample.feeds, sample.fetches)
-    outputs, fetches = [], {}
-    for number, name in enumerate(sample.fetches):
-        array = types[name]
-        if array.ndim == 0 or len(array) != len(next(iter(sample.feeds.values()))):
-            return None
-        output = "action" if number == 0 else f"extra_{number}"
-        outputs.append(
-            TensorSpec(
-                output, Role.CONTINUOUS if number == 0 else Role.OTHER, array.dtype.name, (None, *array.shape[1:])
-            )
-        )
-        fetches[output] = name
-    signature = PolicySignature(inputs=tuple(specs), outputs=tuple(outputs), family="test", action_space="continuous")
-    return Policy("sample", Graph(tuple(nodes)), signature, {s.name: s.name for s in specs}, fetches)
 
 
 #: Op → the titles of its samples that version 16 cannot hold, or that not every Barracuda computes.

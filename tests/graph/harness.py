@@ -17,7 +17,7 @@ from msgspec.structs import replace
 
 from converters.files import tensorflow_messages as schema
 from converters.files.children.process import LoadedModel
-from converters.formats.format import WriteOptions
+from converters.formats.format import Artifact, WriteOptions
 from converters.formats.frozen_graph.encode import encode
 from converters.formats.registry import WRITTEN
 from converters.graph.nodes import Graph, Node
@@ -106,13 +106,7 @@ class Runtimes:
         """The outputs of a policy as source code of a format, compiled where that needs it."""
         (runtime,) = WRITTEN[key].runtimes
         self.need(runtime)
-        inputs = tuple(replace(s, role=Role.PARAMETER) for s in policy.signature.inputs)
-        signature = replace(policy.signature, inputs=inputs)
-        code = code or CodeOptions()
-        tool = {"name": "export-model", "version": "test", "code": code.to_dict()}
-        contract = Contract(policy.name, signature, Origin("test", "0" * 64), policy.source, tool)
-        how = WriteOptions(contract.compact(), code=code)
-        artifact = WRITTEN[key].artifact(replace(policy, signature=signature), how)
+        artifact = program_of(key, policy, code or CodeOptions())
         root = self._folder / str(next(self._numbers))
         artifact.write(root)
         model = self._pool.process(runtime).load(str(root / artifact.main), kind="graph", format=key, seed=1)
@@ -137,6 +131,16 @@ def policy_of(graph: Graph, fetches: Sequence[str]) -> Policy:
     outputs = [_spec(n, types) for n in names]
     signature = PolicySignature(inputs=tuple(inputs), outputs=tuple(outputs), family="test", action_space="continuous")
     return Policy("sample", graph, signature, {s.name: s.name for s in inputs}, {n: n for n in names})
+
+
+def program_of(key: str, policy: Policy, code: CodeOptions) -> Artifact:
+    """A policy as source code of a format, whatever its inputs are called. Raises UnsupportedOpError."""
+    inputs = tuple(replace(s, role=Role.PARAMETER) for s in policy.signature.inputs)
+    signature = replace(policy.signature, inputs=inputs)
+    tool = {"name": "export-model", "version": "test", "code": code.to_dict()}
+    contract = Contract(policy.name, signature, Origin("test", "0" * 64), policy.source, tool)
+    how = WriteOptions(contract.compact(), code=code)
+    return WRITTEN[key].artifact(replace(policy, signature=signature), how)
 
 
 def _spec(name: str, types: Types) -> TensorSpec:
