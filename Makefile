@@ -18,7 +18,7 @@ help:
 	@echo "make test      lint, types and all tests (installs Chromium, gcc and Mono where apt-get can)"
 	@echo "make docs      the documentation as a site in build/docs"
 	@echo "make gallery   five trained policies that act in a browser, as a static folder in build/gallery"
-	@echo "make figures   docs/figures.md anew, from ../shared (minutes), and docs/consumers.md"
+	@echo "make figures   docs/figures.md anew, from ../shared (minutes), docs/consumers.md and operators.md"
 	@echo "make pictures  the pictures of the page and of a report in docs/pictures, anew, from Chromium (minutes)"
 	@echo "make bench     speed, memory and size beside what a user would run instead"
 	@echo "make fuzz      damaged files of every kind, N=20000 of each (hours); what came of them, counted"
@@ -87,6 +87,7 @@ docs: install
 figures: install
 	$(BIN)/python -m tests.figures
 	$(BIN)/python -m tests.consumers
+	$(BIN)/python -m tests.operators
 
 pictures: install browser
 	$(BIN)/python -m tests.pictures

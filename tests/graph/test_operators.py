@@ -1,0 +1,96 @@
+"""docs/operators.md: each op × target is written as one, as several or refused by its name, and the page says which."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from converters.graph.ops.base import written_as_older
+from converters.graph.ops.table import SPELLINGS, TABLE
+from converters.runtimes.pool import RuntimePool
+from converters.runtimes.registry import available_runtimes
+from tests import operators
+from tests.graph.samples import SAMPLES
+from tests.operators import ONE, OPS, REFUSED, SEVERAL, WRITERS, Outcome, cell, outcomes, row_begins
+
+each_op = pytest.mark.parametrize("op", OPS)
+LINES = operators.PAGE.read_text(encoding="utf-8").splitlines()
+
+
+def titled(op: str) -> list[str]:
+    return [line for line in LINES if line.startswith(f"| `{op}` |")]
+
+
+def cells_of(op: str) -> dict[str, str]:
+    """An op's cells in the committed page, by the titles of the columns."""
+    (titles,) = (line for line in LINES if line.startswith("| op | rounds |"))
+    return dict(zip(titles.strip("| ").split(" | "), titled(op)[0].strip("| ").split(" | "), strict=True))
+
+
+def test_every_op_has_a_row_or_is_written_as_those_that_have() -> None:
+    """None is silently absent; a row for each op that has samples, which tests/graph/test_ops.py asks for."""
+    assert {s.op for s in SAMPLES} == set(OPS)
+    assert {*OPS, *operators.OLDER} == set(TABLE)
+    (older,) = (line for line in LINES if line.startswith("Written as these first"))
+    assert all((f"`{op}`" in older) == (TABLE[op].infer is written_as_older) for op in TABLE)
+    assert not any(titled(op) for op in SPELLINGS)
+
+
+@each_op
+def test_each_target_writes_an_op_or_refuses_it_by_its_name(op: str) -> None:
+    """What an op is written as before a target is asked may be what is refused."""
+    made = {op} | {n.op for sample, _ in operators.samples_of(op) for n in sample.nodes}
+    for title in WRITERS:
+        found = list(outcomes(op, title))
+        assert sum(cell(found).startswith(state) for state in (ONE, SEVERAL, REFUSED)) == 1, title
+        for outcome in found:
+            if outcome.refused is not None:
+                assert {name for _, name in outcome.refused} & (made if TABLE[op].older else {op}), title
+
+
+@each_op
+def test_the_page_says_what_the_writers_did(op: str) -> None:
+    assert any(line.startswith(row_begins(op)) for line in titled(op)), row_begins(op)
+
+
+def test_the_page_is_that_of_the_samples(processes: RuntimePool) -> None:
+    (info,) = (i for i in available_runtimes() if i.name == "js")
+    if not info.installed:
+        pytest.skip(f"js is not here; get it with: {info.how}")
+    assert operators.PAGE.read_text(encoding="utf-8") == operators.page(processes)
+
+
+def test_a_kernel_that_is_not_there_is_a_refusal(processes: RuntimePool, tmp_path: Path) -> None:
+    """A page runs every model of ours but those that are not written."""
+    found = {op: cell(operators.kernel_outcomes(op, processes, tmp_path)) for op in ("Tanh", "Where")}
+    assert found == {"Tanh": ONE, "Where": REFUSED}
+
+
+@pytest.mark.parametrize(
+    ("op", "title", "expected"),
+    [
+        ("Erf", "LiteRT", SEVERAL),  # LiteRT's schema has no operator for it
+        ("Sin", "`.nn`", REFUSED),  # version 16 has no such layer
+        ("Split", "ONNX", f"{ONE}−"),  # parts of a length that is not known
+        ("Rsqrt", "ONNX", SEVERAL),  # of Sqrt and Reciprocal
+        ("Where", "TensorFlow.js", REFUSED),  # its model would have to be run asynchronously
+        ("Softmax", "code", f"{ONE}+"),  # of one row of two numbers, else the largest, the sum and the shares
+        ("LeakyRelu", "TensorFlow", SEVERAL),  # TensorFlow 1.4 lacks it
+        ("_FusedMatMul", "TensorFlow", REFUSED),  # it came with TensorFlow 1.15
+    ],
+)
+def test_cells_that_are_known(op: str, title: str, expected: str) -> None:
+    assert cells_of(op)[title] == expected
+
+
+def test_a_cell_says_one_of_three_and_marks_where_samples_differ() -> None:
+    one, several = Outcome(["ADD"]), Outcome(["ADD", "MUL"])
+    refused, upstream = Outcome(refused=(("op", "Add"),)), Outcome(["SHAPE", "ADD"], counts=False)
+    assert cell([]) == ""
+    assert [cell([o]) for o in (one, several, refused, upstream)] == [ONE, SEVERAL, REFUSED, SEVERAL]
+    assert cell([one, several, refused]) == f"{ONE}+−"
+    assert cell([several, refused]) == f"{SEVERAL}−"
+    assert cell([one, upstream]) == ONE
+    assert cell([Outcome(["CAST", "ADD", "RESHAPE"])]) == cell([Outcome(["CAST"])]) == ONE
+    assert cell([Outcome(["Gather", "Gather"], results=2)]) == ONE

@@ -1,0 +1,328 @@
+"""``python -m tests.operators``: docs/operators.md, what each op of the table becomes in each target.
+
+No entry's lowering is read: the samples of an op (tests/graph/samples) are compiled and written, each for each target.
+What stands in the file for it is counted, or the refusal is taken, which names the op.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import pkgutil
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from dataclasses import replace as again
+from pathlib import Path
+
+import numpy as np
+import onnx
+
+from converters.compiler.passes.fold import fold
+from converters.compiler.passes.normalise import normalise
+from converters.compiler.targets import PROGRAM, prepare
+from converters.files import tensorflow_messages as schema
+from converters.files.children.process import RunFailedError
+from converters.formats.format import WriteOptions
+from converters.formats.litert.flatbuffer import decode
+from converters.formats.litert.schema import OPERATOR_NAMES
+from converters.formats.registry import WRITTEN
+from converters.graph import ops as families
+from converters.graph import program as loops
+from converters.graph.nodes import Graph, Node, TensorShape
+from converters.graph.ops.approximations import APPROXIMATIONS
+from converters.graph.ops.barracuda.vocabulary import Activation, LayerType
+from converters.graph.ops.base import written_as_older
+from converters.graph.ops.table import TABLE
+from converters.graph.run import run_graph
+from converters.graph.types import FLOAT32
+from converters.policy.policy import Policy
+from converters.runtimes.pool import RuntimePool
+from signatures.code import CodeOptions
+from signatures.errors import UnsupportedOpError
+from tests.barracuda.nn_running import action_model, as_policy
+from tests.commands import ROOT
+from tests.graph.harness import policy_of, program_of
+from tests.graph.samples import SAMPLES, Sample
+
+PAGE = ROOT / "docs" / "operators.md"
+ONE, SEVERAL, REFUSED = "●", "◐", "○"
+#: Beside the symbol: some samples take several ops where others take one; some are refused.
+SOME_SEVERAL, SOME_REFUSED = "+", "−"
+_PRECISIONS = {"exact": "=", "rounded": "∘", "summed": "∑", "approximate": "≈"}
+_OPTIONS = WriteOptions('{"tool": {"version": "test"}}')
+
+#: Moves and casts, which stand around an operator where axes lie otherwise or a number is narrower: not counted where
+#: another operator is.
+_EDGES = frozenset(
+    (
+        *("Identity", "Const", "Placeholder", "Cast", "Reshape", "Transpose", "Squeeze", "Unsqueeze", "ExpandDims"),
+        *("CAST", "RESHAPE", "TRANSPOSE", "SQUEEZE", "EXPAND_DIMS", "NOP", "LOAD", "FLATTEN"),
+    )
+)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a target made of a sample: the operators of a result, or the refusal, by nodes and ops, with its reason."""
+
+    operators: Sequence[str] = ()
+    results: int = 1
+    refused: tuple[tuple[str, str], ...] | None = None
+    #: Whether the operators are the op's alone.
+    counts: bool = True
+
+    @property
+    def state(self) -> str:
+        """One of the three symbols."""
+        if self.refused is not None:
+            return REFUSED
+        return ONE if sum(o not in _EDGES for o in self.operators) <= self.results else SEVERAL
+
+
+def compiled(sample: Sample) -> Sample:
+    """A sample whose graph is as the compiler leaves it to the writers."""
+    graph = fold(normalise(sample.graph, sample.fetches)).prune(sample.fetches)
+    return again(sample, nodes=graph.nodes, feeds={name: a for name, a in sample.feeds.items() if name in graph})
+
+
+def samples_of(op: str) -> Iterator[tuple[Sample, bool]]:
+    """Each sample of an op, compiled, and whether the op alone computes in it."""
+    for sample in (s for s in SAMPLES if s.op == op):
+        yield compiled(sample), all(n.name == "op" or TABLE[n.op].start for n in sample.nodes)
+
+
+# ------------------------------------------------------------------ what stands in a file
+
+
+def _written(key: str, sample: Sample, path: str = "") -> bytes:
+    artifact = WRITTEN[key].artifact(policy_of(sample.graph, sample.fetches), _OPTIONS)
+    return artifact.files[path or artifact.main].to_bytes()
+
+
+def _tensorflow(sample: Sample) -> list[str]:
+    saved = schema.SavedModel.FromString(_written("saved_model", sample, "saved_model/saved_model.pb"))
+    frozen = schema.GraphDef.FromString(_written("bytes", sample))
+    assert {n.op for n in frozen.node} <= {n.op for n in saved.meta_graphs[0].graph_def.node}
+    return [n.op for n in frozen.node]
+
+
+def _tfjs(sample: Sample) -> list[str]:
+    model = json.loads(_written("tfjs", sample, "tfjs/model.json"))
+    return [n["op"] for n in model["modelTopology"]["node"]]
+
+
+def _onnx(sample: Sample) -> list[str]:
+    return [n.op_type for n in onnx.ModelProto.FromString(_written("onnx", sample)).graph.node]
+
+
+def _litert(sample: Sample) -> list[str]:
+    model = decode(_written("litert", sample))
+    codes = [OPERATOR_NAMES[c.get("builtin_code", 0)] for c in model["operator_codes"]]
+    return [codes[o.get("opcode_index", 0)] for o in model["subgraphs"][0].get("operators", ())]
+
+
+def _nn(sample: Sample) -> list[str] | None:
+    """None where nothing is said: ML-Agents has nothing to feed the sample with."""
+    policy = as_policy(sample)
+    if policy is not None:
+        return _layers(policy)
+    beside, alone = (as_policy(s) for s in _beside_an_observation(sample))
+    if beside is None or alone is None:
+        return None
+    return list((Counter(_layers(beside)) - Counter(_layers(alone))).elements())
+
+
+def _layers(policy: Policy) -> list[str]:
+    """The layers; one that passes on what it is given is an activation without a function."""
+    return [
+        "NOP"
+        if layer.type == LayerType.ACTIVATION and layer.activation == Activation.NONE
+        else LayerType(layer.type).name
+        for layer in action_model(policy).layers
+    ]
+
+
+def _beside_an_observation(sample: Sample) -> Iterator[Sample]:
+    """The sample's result, of no agent, added to an observation; and a constant in its place."""
+    value = run_graph(sample.graph, sample.feeds, ["op"])["op"]
+    agents = next((len(a) for a in sample.feeds.values() if a.ndim), 2)
+    seen = np.zeros((agents, max(value.size, 1)), np.float32)
+    fed = Node("seen", "Placeholder", attrs={"dtype": FLOAT32, "shape": TensorShape((None, seen.shape[1]))})
+    row = [
+        Node("one", "Const", value=np.array([1, value.size], np.int32)),
+        Node("row", "Reshape", ("op", "one")),
+        Node("number", "Cast", ("row",), {"DstT": FLOAT32}),
+        Node("sum", "Add", ("seen", "number")),
+    ]
+    for nodes in (sample.nodes, (Node("op", "Const", value=value),)):
+        made = again(sample, nodes=(fed, *nodes, *row), feeds={"seen": seen, **sample.feeds})
+        yield _Ended(**vars(made))
+
+
+class _Ended(Sample):
+    """A sample with nodes behind its op."""
+
+    @property
+    def fetches(self) -> list[str]:
+        return ["sum"]
+
+
+def _program(sample: Sample) -> list[str] | None:
+    """None where nothing is said: no contract has an output of no numbers. One without axes is given one."""
+    results = run_graph(sample.graph, sample.feeds, sample.fetches)
+    if not all(a.size for a in results.values()):
+        return None
+    graph, fetches = sample.with_shapes(lambda _, array: TensorShape(array.shape)), sample.fetches
+    if not all(a.ndim for a in results.values()):
+        axis = (Node("axis", "Const", value=np.array([1], np.int32)), Node("row", "Reshape", ("op", "axis")))
+        graph, fetches = Graph((*graph.nodes, *axis)), ["row"]
+    policy = policy_of(graph, fetches)
+    program = loops.program_of(prepare(policy, PROGRAM), policy.feeds, policy.fetches)
+    for key in (key for key, form in WRITTEN.items() if form.program):
+        assert program_of(key, policy, CodeOptions()).files
+    return ["loop"] * len(program.stages)
+
+
+#: The columns but the last: their titles, and what gives the operators that a sample became there.
+WRITERS: Mapping[str, Callable[[Sample], Sequence[str] | None]] = {
+    "TensorFlow": _tensorflow,
+    "TensorFlow.js": _tfjs,
+    "ONNX": _onnx,
+    "`.nn`": _nn,
+    "LiteRT": _litert,
+    "code": _program,
+}
+KERNEL = "kernel"
+
+
+def outcomes(op: str, title: str) -> Iterator[Outcome]:
+    """What the target of a column makes of each sample of an op that says something there."""
+    for sample, alone in samples_of(op):
+        try:
+            operators = WRITERS[title](sample)
+        except UnsupportedOpError as error:
+            if any(name in sample.graph for name, _ in error.issues) or not error.issues:
+                yield Outcome(refused=tuple(error.issues))
+        else:
+            if operators is not None:
+                yield Outcome(operators, sample.outputs, counts=alone)
+
+
+def kernel_outcomes(op: str, pool: RuntimePool, folder: Path) -> Iterator[Outcome]:
+    """What becomes of an op's samples by our own kernels in JavaScript, which a page runs."""
+    for sample, alone in samples_of(op):
+        policy = policy_of(sample.graph, sample.fetches)
+        try:
+            artifact = WRITTEN["tfjs"].artifact(policy, _OPTIONS)
+            artifact.write(folder)
+            model = pool.process("js").load(str(folder / artifact.main))
+            model.predict(dict(sample.feeds), [s.name for s in policy.signature.outputs])
+            model.unload()
+        except UnsupportedOpError as error:
+            yield Outcome(refused=tuple(error.issues))
+        except RunFailedError as error:  # "no kernel for the op …"
+            yield Outcome(refused=(("op", op),) if f" {op}" in str(error) else ())
+        else:
+            yield Outcome(_tfjs(sample), sample.outputs, counts=alone)
+
+
+def cell(found: Iterable[Outcome]) -> str:
+    """One of the three symbols, with marks where samples of the op differ; empty where none says anything."""
+    found = list(found)
+    written = [o for o in found if o.refused is None]
+    if not written:
+        return REFUSED if found else ""
+    states = {o.state for o in written if o.counts} or {o.state for o in written}
+    text = ONE if ONE in states else SEVERAL
+    return text + SOME_SEVERAL * (len(states) > 1) + SOME_REFUSED * (len(written) < len(found))
+
+
+# ------------------------------------------------------------------ the page
+
+#: What is left of a policy's ops when a target is asked, by the file of its entry; and what is written as these before.
+FAMILIES: Mapping[str, Sequence[str]] = {
+    name: found
+    for name in sorted(m.name for m in pkgutil.iter_modules(families.__path__))
+    for module in [importlib.import_module(f"{families.__name__}.{name}")]
+    if (found := [o.name for o in getattr(module, "OPS", ()) if o.infer is not written_as_older])
+}
+OPS = [op for found in FAMILIES.values() for op in found]
+OLDER = [name for name, entry in TABLE.items() if entry.infer is written_as_older]
+
+HEAD = f"""\
+# Operations and targets
+
+What each operation becomes, found by writing its samples, which the tests compare in all runtimes.
+
+{ONE} one operator of the target, or none (a constant, another view); casts and moved axes do not count. \
+{SEVERAL} several.
+{REFUSED} refused, by name. `{SOME_SEVERAL}`: some forms take several. `{SOME_REFUSED}`: some are refused.
+
+*TensorFlow*: `.bytes` and SavedModel; *code*: C, C# and JavaScript, in nests of loops; *kernel*: this project's own, of
+the TensorFlow.js model. *Rounds*: {_PRECISIONS["exact"]} never, {_PRECISIONS["rounded"]} once, \
+{_PRECISIONS["summed"]} sums in any order, {_PRECISIONS["approximate"]} approximated (below).
+`_Fused…` are made of layers, for targets that have them.
+"""
+BOUNDS = """\
+## Approximated functions
+
+How far results are off at most: units in the last place/absolute, whichever is more. Empty: as *processor*. Measured by
+`tests/runtimes/test_approximations.py` in TensorFlow (1.4 too), onnxruntime, TensorFlow.js; *graphics*: WebGL;
+*phone*: LiteRT; *compiled*: OpenVINO.
+"""
+
+
+def writer_cells(op: str) -> list[str]:
+    """An op's cells but the last."""
+    return [cell(outcomes(op, title)) for title in WRITERS]
+
+
+def line(cells: Iterable[str]) -> str:
+    """A line of a table."""
+    return f"| {' | '.join(cells)} |"
+
+
+def row_begins(op: str) -> str:
+    """An op's line up to the cell that needs Node."""
+    entry = TABLE[op]
+    return line([f"`{op}`", _PRECISIONS["exact" if entry.exact else entry.precision], *writer_cells(op)])
+
+
+def page(pool: RuntimePool) -> str:
+    """Return the page in Markdown."""
+    with tempfile.TemporaryDirectory() as folder:
+        return "\n".join((HEAD, *_matrix(pool, Path(folder)), "", BOUNDS, *_bounds())) + "\n"
+
+
+def _matrix(pool: RuntimePool, folder: Path) -> Iterator[str]:
+    titles = ["op", "rounds", *WRITERS, KERNEL]
+    yield line(titles)
+    yield f"|{'---|' * len(titles)}"
+    for family, found in FAMILIES.items():
+        yield line([f"**{family}**", *[""] * (len(titles) - 1)])
+        for op in found:
+            yield f"{row_begins(op)} {cell(kernel_outcomes(op, pool, folder))} |"
+    yield ""
+    yield f"Written as these first: {', '.join(f'`{op}`' for op in OLDER)}."
+
+
+def _bounds() -> Iterator[str]:
+    yield line(["op", *APPROXIMATIONS])
+    yield f"|{'---|' * (1 + len(APPROXIMATIONS))}"
+    usual, *others = APPROXIMATIONS.values()
+    for op, bound in usual.items():
+        yield line([f"`{op}`", _bound(bound), *("" if o[op] == bound else _bound(o[op]) for o in others)])
+    unmeasured = [o for o in OPS if TABLE[o].precision == "approximate" and o not in usual]
+    yield ""
+    yield f"Not measured: {', '.join(f'`{op}`' for op in unmeasured)}."
+
+
+def _bound(bound: tuple[float, float]) -> str:
+    return "/".join(f"{number:g}" for number in bound if number)
+
+
+if __name__ == "__main__":
+    with RuntimePool() as processes:
+        PAGE.write_text(page(processes), encoding="utf-8")
