@@ -21,6 +21,8 @@ SIZE = 2.0**-17
 _UNDERFLOW = float(np.log(np.finfo(np.float32).tiny))
 #: Of histograms: decades run from 10^FIRST to 10^LAST; the first takes what is smaller, the last what is larger.
 FIRST, LAST = -12, 3
+#: Why an answer differs that no number can say of.
+ONE_SIDED = "NaN or infinity on one side only"
 #: Entry 0 counts equal elements, entry 1 + i those of the decade from 10^(FIRST + i) on.
 BINS = 1 + LAST - FIRST + 1
 
@@ -59,7 +61,8 @@ def compare(
     ``free`` marks elements where another answer is right too (a tie, a reference without one). ``narrowed`` allows
     int32 for int64. ``most`` are bounds per column that go before larger ones.
     ``rounding`` is an absolute difference per element that float32 itself explains; where it is larger than the
-    tolerance it takes its place. A NaN or infinity must stand at the same place on both sides.
+    tolerance it takes its place, and where it is infinite there is no answer. A NaN or infinity must stand at the same
+    place on both sides.
     """
     if reference.shape != candidate.shape:
         return wrong(f"shape {list(candidate.shape)} instead of {list(reference.shape)}")
@@ -69,11 +72,13 @@ def compare(
     if not reference.size:
         return Difference(0.0, 0.0, True)
     a, b = candidate.astype(np.float64), reference.astype(np.float64)
+    if rounding is not None and np.isinf(rounding).any():
+        free = np.isinf(rounding) | (False if free is None else free)
     odd = ~np.isfinite(a) | ~np.isfinite(b)
     if odd.any():
         same = (np.isnan(a) & np.isnan(b)) | (a == b) | (False if free is None else free)
         if not same[odd].all():
-            return replace(wrong("NaN or infinity on one side only"), worst=int((odd & ~same).argmax()))
+            return replace(wrong(ONE_SIDED), worst=int((odd & ~same).argmax()))
         a, b = np.where(odd, 0.0, a), np.where(odd, 0.0, b)
     difference = np.abs(a - b)
     if free is not None:

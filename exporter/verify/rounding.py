@@ -3,7 +3,8 @@
 A difference is rounding if it is at most ``FACTOR`` times what moving every intermediate result as far as rounding, or
 the runtime's approximation of a function, may move it makes (converters/graph/jitter.py), the largest of ``RUNS``, or,
 to make sure, of ``MORE_RUNS`` more. It matters for inputs of 1e3, for long sums, where a formula cancels, and where a
-memory carries it from step to step; elsewhere the default tolerance is larger.
+memory carries it from step to step; elsewhere the default tolerance is larger. What rests on a number that is not told
+from zero has no answer (converters/graph/underflow.py).
 """
 
 from __future__ import annotations
@@ -58,6 +59,17 @@ class Rounding:
                 self._known[key] = []
             else:
                 self._known[key] = self._largest_of([exact], [[m] for m in moved])
+        return self._known[key][0] if self._known[key] else {}
+
+    def open_elements(self, model: LoadedModel, case: Case, runtime: str) -> Mapping[str, np.ndarray]:
+        """Of one input, infinite where an element rests on a number that is not told from zero, else 0."""
+        key = (case.name, f"undetermined by {_ARITHMETIC.get(runtime, 'processor')}", False)
+        if key not in self._known:
+            request = {"undetermined": True, "arithmetic": _ARITHMETIC.get(runtime, "processor")}
+            try:
+                self._known[key] = model.run_all([case.feeds], self._names, [request])
+            except RunFailedError:
+                self._known[key] = []
         return self._known[key][0] if self._known[key] else {}
 
     def steps(

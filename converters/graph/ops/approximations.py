@@ -65,6 +65,7 @@ _ONE = 1 + 2.0**-23
 RANGES: Mapping[str, tuple[float, float]] = {
     **dict.fromkeys(("Cos", "Erf", "Sin", "Tanh"), (-_ONE, _ONE)),
     **dict.fromkeys(("Sigmoid", "Softmax"), (0.0, _ONE)),
+    "Exp": (0.0, float("inf")),
 }
 APPROXIMATIONS: Mapping[Arithmetic, Mapping[str, tuple[float, float]]] = {
     "processor": _PROCESSOR,

@@ -1,0 +1,69 @@
+"""What rests on a number that float32, or a runtime's approximation of a function, cannot tell from zero.
+
+``log(sigmoid(x))`` of -30 is -30, and -∞ where a runtime's sigmoid is zero (onnxruntime: from -17 on); of -1e3 it is
+-∞, -97 or -87. Whatever is computed with that has no answer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from converters.graph.jitter import Jitter
+from converters.graph.nodes import Node
+from converters.graph.ops.approximations import RANGES
+from converters.graph.ops.base import OpDef
+
+#: The smallest float32 that has all its digits; a runtime may take what is smaller for zero.
+TINY = np.finfo(np.float32).tiny
+
+
+class Ends(Jitter):
+    """Runs of a graph at the two ends of what a number may be that is not told from zero.
+
+    In the first run it is zero; ``keep`` begins one in which it is as large as it may be. With ``mark``, what is finite
+    in one of the two alone is NaN from there on.
+    """
+
+    def __init__(self, arithmetic: str) -> None:
+        super().__init__(0, arithmetic)
+        self._finite: list[np.ndarray] = []
+        self._kept, self._marks, self._number = False, False, 0
+
+    def keep(self, *, mark: bool) -> None:
+        """Begin another run."""
+        self._kept, self._marks, self._number = True, mark, 0
+
+    def operands(self, entry: OpDef, operands: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """What an op reads, as it is."""
+        return list(operands)
+
+    def results(
+        self, entry: OpDef, node: Node, operands: Sequence[np.ndarray], results: Sequence[np.ndarray]
+    ) -> Sequence[np.ndarray]:
+        """What an op gives, at this run's end."""
+        return [self._mark(self._settle(entry, r)) if r.dtype == np.float32 else r for r in results]
+
+    def _settle(self, entry: OpDef, array: np.ndarray) -> np.ndarray:
+        """An op's result with what is not told from zero at this run's end.
+
+        A zero is one of these where the function has none (exp, sigmoid, softmax).
+        """
+        positive = entry.name in RANGES and RANGES[entry.name][0] == 0
+        _, absolute = self._approximations.get(entry.name, (0, 0)) if positive else (0, 0)
+        end = np.float32(max(absolute, TINY))
+        lost = np.abs(array) < end
+        if not positive:
+            lost &= array != 0
+        return np.where(lost, np.copysign(end if self._kept else np.float32(0), array), array) if lost.any() else array
+
+    def _mark(self, array: np.ndarray) -> np.ndarray:
+        finite = np.isfinite(array)
+        if not self._kept:
+            self._finite.append(finite)
+            return array
+        before, self._number = self._finite[self._number], self._number + 1
+        if not self._marks or before.shape != finite.shape:
+            return array
+        return np.where(before == finite, array, np.float32(np.nan))

@@ -1,0 +1,120 @@
+"""Numbers that float32 does not decide: log(sigmoid(x)), as PyTorch exports LogSigmoid, of a sigmoid that may be zero.
+
+Runtimes give -∞, -103, -97 or -87 there, and agree wherever the sigmoid has its digits; onnxruntime and TensorFlow show
+it, and a fault that changes ordinary numbers is found beside it all the same.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from converters.graph.nodes import Graph, Node, TensorShape
+from converters.graph.run import run_graph
+from converters.graph.underflow import Ends
+from converters.runtimes.pool import RuntimePool
+from exporter.export.pipeline import ExportOptions, export
+from tests.faults.test_blind_spots import Arrays, Feeds, honest, verified
+from tests.handmade import constant, dense, graph_bytes, node, placeholder
+from tests.onnx_reader.models import floats, model, save
+from tests.onnx_reader.models import node as onnx_node
+
+
+def logarithms(folder: Path, before_log: str = "Sigmoid") -> Path:
+    """``action`` = a dense layer of the logarithm of another's sigmoid."""
+    nodes = [
+        placeholder("vector_observation"),
+        *dense("first", "vector_observation", 3, 4),
+        node("squashed", before_log, "first"),
+        node("logarithm", "Log", "squashed"),
+        constant("kernel", np.linspace(-1, 1.2, 8, dtype=np.float32).reshape(4, 2)),
+        node("action", "MatMul", "logarithm", "kernel", transpose_a=False, transpose_b=False),
+    ]
+    (folder / "logarithms.bytes").write_bytes(graph_bytes(nodes))
+    return folder / "logarithms.bytes"
+
+
+@pytest.mark.parametrize("runtimes", ["tensorflow", "onnxruntime", "tensorflow,onnxruntime"])
+def test_runtimes_agree_where_float32_has_an_answer(runtimes: str, tmp_path: Path, processes: RuntimePool) -> None:
+    for runtime in runtimes.split(","):
+        pytest.importorskip(runtime)
+    nodes = [
+        onnx_node("MatMul", ["obs", "w"], "first"),
+        onnx_node("Sigmoid", ["first"], "squashed"),
+        onnx_node("Log", ["squashed"], "logarithm"),
+        onnx_node("MatMul", ["logarithm", "u"], "actions"),
+    ]
+    weights = {"w": floats(3, 4), "u": floats(4, 2)}
+    source = save(model(nodes, {"obs": (np.float32, ["b", 3])}, ["actions"], weights), tmp_path)
+    options = ExportOptions(tmp_path / "out", ("bytes", "onnx"), verify=runtimes)
+    (result,) = export([source], options, pool=processes)
+    assert result.report is not None
+    assert result.report.passed is True, [f.explanation() for f in result.report.failures]
+
+
+def lowest(feeds: Feeds, answers: Arrays) -> Arrays:
+    """An answer that is a number where infinity is right, as far inputs make it."""
+    return {n: np.nan_to_num(a, nan=-97, posinf=97, neginf=-97).astype(a.dtype) for n, a in answers.items()}
+
+
+def test_a_number_in_place_of_infinity_is_no_fault_at_the_edges(tmp_path: Path, processes: RuntimePool) -> None:
+    report = verified(logarithms(tmp_path), tmp_path, processes, lowest)
+    assert report.passed is True, [f.explanation() for f in report.failures]
+
+
+def test_the_logarithm_of_a_zero_that_is_one_has_an_answer(tmp_path: Path, processes: RuntimePool) -> None:
+    """A relu's zeros are exact: every runtime has -∞ there."""
+    assert verified(logarithms(tmp_path, "Relu"), tmp_path, processes, lowest).passed is False
+    assert verified(logarithms(tmp_path, "Relu"), tmp_path, processes, honest).passed is True
+
+
+def infinite_at_ordinary_inputs(feeds: Feeds, answers: Arrays) -> Arrays:
+    ordinary = np.abs(feeds["state"]).max(axis=1, initial=0) < 2
+    return {n: np.where(ordinary[:, None], -np.inf, a).astype(a.dtype) for n, a in answers.items()}
+
+
+def off_at_ordinary_inputs(feeds: Feeds, answers: Arrays) -> Arrays:
+    ordinary = np.abs(feeds["state"]).max(axis=1, initial=0) < 2
+    return {n: np.where(ordinary[:, None], a + 1e-3, a).astype(a.dtype) for n, a in answers.items()}
+
+
+@pytest.mark.parametrize("fault", [infinite_at_ordinary_inputs, off_at_ordinary_inputs])
+def test_a_fault_at_ordinary_inputs_is_found(fault: object, tmp_path: Path, processes: RuntimePool) -> None:
+    report = verified(logarithms(tmp_path), tmp_path, processes, fault)  # type: ignore[arg-type]
+    assert report.passed is False and "action" in {f.output for f in report.failures}
+
+
+def test_a_fault_at_far_inputs_is_found_where_numbers_are_finite(tmp_path: Path, processes: RuntimePool) -> None:
+    def far(feeds: Feeds, answers: Arrays) -> Arrays:
+        return {n: np.where(np.abs(a) > 1e3, -np.inf, a).astype(a.dtype) for n, a in answers.items()}
+
+    nodes = [placeholder("vector_observation"), *dense("action", "vector_observation", 3, 2)]
+    (tmp_path / "linear.bytes").write_bytes(graph_bytes(nodes))
+    assert verified(tmp_path / "linear.bytes", tmp_path, processes, far).passed is False
+
+
+@pytest.mark.parametrize(
+    ("op", "values", "undetermined"),
+    [
+        ("Sigmoid", [-1e3, -90, -30, -17, -14, 0, 30], [True, True, True, True, False, False, False]),
+        ("Exp", [-1e3, -104, -90, -87, -30, 0, 30], [True, True, True, False, False, False, False]),
+        ("Relu", [-1e3, -1, 0, 1e-38, 1e-30, 1, 30], [False, False, False, True, False, False, False]),
+    ],
+)
+def test_what_is_not_told_from_zero_is_marked(op: str, values: list[float], undetermined: list[bool]) -> None:
+    nodes = [
+        Node("x", "Placeholder", attrs={"dtype": np.dtype(np.float32), "shape": TensorShape((None,))}),
+        Node("made", op, ("x",)),
+        Node("y", "Log", ("made",)),
+        Node("z", "Tanh", ("y",)),
+    ]
+    graph, ends = Graph(tuple(nodes)), Ends("processor")
+    runs = []
+    for mark in (None, False, True):
+        if mark is not None:
+            ends.keep(mark=mark)
+        runs.append(run_graph(graph, {"x": np.array(values, np.float32)}, ["made", "y", "z"], ends))
+    assert np.isnan(runs[2]["y"]).tolist() == np.isnan(runs[2]["z"]).tolist() == undetermined
+    assert (runs[0]["made"] <= runs[1]["made"]).all()
