@@ -13,7 +13,7 @@ import onnx.defs
 import pytest
 
 from converters.graph.nodes import Graph, Node
-from converters.graph.ops import table
+from converters.graph.ops import activations, table
 from converters.graph.ops.table import CONTROL_FLOW, FORBIDDEN, SPELLINGS, TABLE, hands_on, is_fed, passes_on, traits
 from converters.graph.run import run_graph
 from tests.commands import ROOT
@@ -199,6 +199,14 @@ def test_an_elementwise_op_sees_one_element_at_a_time(op: str) -> None:
         feeds = {r: np.broadcast_to(values[r], values["op"].shape).reshape(-1)[order] for r in node.inputs}
         again = run_graph(Graph((node,)), feeds, ["op"])["op"]
         np.testing.assert_array_equal(again, result[order], sample.title)
+
+
+def test_an_activation_that_is_fused_is_known_to_every_target_that_carries_it() -> None:
+    fused = {op.name for op in TABLE.values() if op.tfjs_fuses}
+    assert fused == {"Relu", "Relu6", "Elu", "Sigmoid"}  # TensorFlow.js's own list, but for Prelu and LeakyRelu
+    for known in (activations.NN_KINDS, activations.LITERT_OPERATORS, activations.LOOPS):
+        assert fused <= known.keys()
+    assert {name for name, op in activations.LITERT_OPERATORS.items() if op.applied} == {"Relu", "Relu6"}
 
 
 def test_spellings_are_no_ops_of_their_own() -> None:

@@ -15,9 +15,9 @@ from converters.graph.ops.barracuda.vocabulary import Activation
 from converters.graph.ops.base import Attr, Lower, OnnxBuilder, OpDef, chain, plain, same_as
 from converters.graph.ops.elementwise import T, smooth, unary, wide
 from converters.graph.ops.litert import elementwise as litert
-from converters.graph.ops.litert.base import builtin
+from converters.graph.ops.litert.base import Operator, builtin
 from converters.graph.ops.loops import elementwise as loops
-from converters.graph.ops.loops.base import elementwise, simple
+from converters.graph.ops.loops.base import Elementwise, simple
 from converters.graph.ops.older import leaky_relu
 
 
@@ -55,7 +55,7 @@ OPS = (
         finite="always",
         tfjs_fuses=True,
         nn=nn.activation(Activation.SIGMOID),
-        loops=elementwise(loops.sigmoid),
+        loops=Elementwise(loops.sigmoid),
         litert=builtin("LOGISTIC"),
     ),
     smooth(
@@ -73,8 +73,8 @@ OPS = (
         "Relu",
         activation="relu",
         nn=nn.activation(Activation.RELU),
-        loops=elementwise(loops.relu),
-        litert=litert.activation("RELU"),
+        loops=Elementwise(loops.relu),
+        litert=Operator("RELU", applied=True),
     ),
     _clamp(
         "Relu6",
@@ -82,8 +82,8 @@ OPS = (
         chain(("Max", 0.0), ("Min", 6.0)),
         activation="relu 6",
         nn=nn.activation(Activation.RELU6),
-        loops=elementwise(loops.relu6),
-        litert=litert.activation("RELU6"),
+        loops=Elementwise(loops.relu6),
+        litert=Operator("RELU6", applied=True),
     ),
     smooth(
         "Elu",
@@ -91,16 +91,16 @@ OPS = (
         activation="elu",
         tfjs_fuses=True,
         nn=nn.activation(Activation.ELU),
-        loops=elementwise(loops.elu),
+        loops=Elementwise(loops.elu),
         litert=builtin("ELU"),
     ),
-    smooth("Selu", _selu, activation="selu", nn=nn.selu(*_SELU), loops=elementwise(loops.selu), litert=litert.selu),
+    smooth("Selu", _selu, activation="selu", nn=nn.selu(*_SELU), loops=Elementwise(loops.selu), litert=litert.selu),
     smooth(
         "Softplus",
         lambda x: np.maximum(x, 0) + np.log1p(np.exp(-np.abs(x))),
         activation="softplus",
         barracuda=decompositions.SOFTPLUS,
-        loops=elementwise(loops.softplus),
+        loops=Elementwise(loops.softplus),
         litert=litert.softplus,
     ),
     unary(
@@ -110,7 +110,7 @@ OPS = (
         tfjs=decompositions.SOFTSIGN.write,  # TensorFlow.js 4.22 has none
         activation="softsign",
         barracuda=decompositions.SOFTSIGN,
-        loops=elementwise(loops.softsign),
+        loops=Elementwise(loops.softsign),
         litert=litert.softsign,
     ),
     OpDef(
@@ -128,6 +128,9 @@ OPS = (
 _BY_NAME = {op.name: op for op in OPS}
 #: Activation → what it is in a ``.nn``, of those that every Barracuda has.
 NN_KINDS = {op.name: op.nn.kind for op in OPS if op.nn is not None and isinstance(op.nn.kind, Activation)}
+#: Activation → its operator in LiteRT, and its loops, of those that a fused op may carry there.
+LITERT_OPERATORS = {op.name: op.litert for op in OPS if isinstance(op.litert, Operator)}
+LOOPS = {op.name: op.loops for op in OPS if isinstance(op.loops, Elementwise)}
 #: What a fused op has beside the attributes of the plain one.
 FUSED = (Attr("num_args", "int", 1), Attr("fused_ops", "str"), Attr("epsilon", "float", 0.0001))
 

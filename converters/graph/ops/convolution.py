@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 from msgspec.structs import replace
 
 from converters.graph.nodes import Node
-from converters.graph.ops.activations import FUSED, NN_KINDS, apply_activations, lower_activated
+from converters.graph.ops.activations import (
+    FUSED,
+    LITERT_OPERATORS,
+    LOOPS,
+    NN_KINDS,
+    apply_activations,
+    lower_activated,
+)
 from converters.graph.ops.barracuda import arrays as nn_arrays
 from converters.graph.ops.barracuda import layers as nn
 from converters.graph.ops.barracuda.base import FIRST, Nn
@@ -233,6 +241,8 @@ _CUDNN = Attr("use_cudnn_on_gpu", "bool", True)
 
 _CONV = (T, _STRIDES, _PADDING, _FORMAT, _DILATIONS, _EXPLICIT)
 _POOL = (T, Attr("ksize", "int", REQUIRED), _STRIDES, _PADDING, _FORMAT, _EXPLICIT)
+_CONV2D = partial(conv2d, known=LITERT_OPERATORS)
+_CONVOLUTION = partial(loops.convolution, known=LOOPS)
 
 
 def _convolution(
@@ -248,9 +258,9 @@ OPS = (
         _conv2d,
         _lower_conv2d,
         [_CUDNN],
-        conv2d,
+        _CONV2D,
         nn=Nn(nn.conv2d),
-        loops=loops.convolution,
+        loops=_CONVOLUTION,
         tfjs=_tfjs_convolution,
         fused="_FusedConv2D",
     ),
@@ -259,9 +269,9 @@ OPS = (
         _fused_conv2d,
         _lower_conv2d,
         [_CUDNN, *FUSED],
-        conv2d,
+        _CONV2D,
         nn=nn.with_activations(nn.conv2d, NN_KINDS),
-        loops=loops.convolution,
+        loops=_CONVOLUTION,
         since="1.13",
     ),
     _convolution(

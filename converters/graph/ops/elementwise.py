@@ -35,7 +35,7 @@ from converters.graph.ops.base import (
 from converters.graph.ops.litert import elementwise as litert
 from converters.graph.ops.litert.base import builtin, steps
 from converters.graph.ops.loops import elementwise as loops
-from converters.graph.ops.loops.base import elementwise, simple
+from converters.graph.ops.loops.base import Elementwise, simple
 from converters.graph.ops.older import clip
 from converters.graph.ops.rewriting import GraphBuilder
 from converters.graph.types import BOOL, INT32, INT64, Symbols, TensorType
@@ -198,7 +198,7 @@ UNARY = (
         plain(np.sign),
         "Sign",
         barracuda=decompositions.SIGN,
-        loops=elementwise(loops.sign),
+        loops=Elementwise(loops.sign),
         litert=builtin("SIGN"),
         precision="exact",
     ),
@@ -207,7 +207,7 @@ UNARY = (
         plain(np.square),
         _lower_square,
         nn=Nn(nn.square),
-        loops=elementwise(loops.square),
+        loops=Elementwise(loops.square),
         litert=litert.square,
     ),
     unary(
@@ -216,7 +216,7 @@ UNARY = (
         "Reciprocal",
         spellings=("Inv",),
         nn=nn.activation(Activation.RECIPROCAL),
-        loops=elementwise(loops.reciprocal),
+        loops=Elementwise(loops.reciprocal),
         litert=litert.reciprocal,
     ),
     unary(
@@ -272,7 +272,7 @@ UNARY = (
         lambda x: np.asarray(1 / np.sqrt(x)),
         chain(("Sqrt", None), ("Reciprocal", None)),
         barracuda=decompositions.RSQRT,
-        loops=elementwise(loops.rsqrt),
+        loops=Elementwise(loops.rsqrt),
         litert=builtin("RSQRT"),
     ),
     smooth("Sin", np.sin, loops=simple("sin"), litert=builtin("SIN")),
@@ -340,7 +340,7 @@ BINARY = (
         nn=Nn(nn.divide),
         spellings=("Div",),
         operand="divisor",
-        loops=elementwise(loops.divide),
+        loops=Elementwise(loops.divide),
         litert=builtin("DIV"),
     ),
     _binary(
@@ -348,7 +348,7 @@ BINARY = (
         _floor_div,
         _lower_floor_div,
         nn=Nn(nn.floor_divide),
-        loops=elementwise(loops.floor_div),
+        loops=Elementwise(loops.floor_div),
         litert=litert.floor_div,
     ),
     _binary(
@@ -399,7 +399,7 @@ BINARY = (
         lambda a, b: np.square(a - b),
         _lower_square,
         nn=Nn(nn.squared_difference),
-        loops=elementwise(loops.square),
+        loops=Elementwise(loops.square),
         litert=litert.square,
     ),
     OpDef(
@@ -420,7 +420,7 @@ BINARY = (
         _lower_add_n,
         (Attr("N", "int", derive="count"), T),
         nn=Nn(nn.add_n),
-        loops=elementwise(loops.add_n),
+        loops=Elementwise(loops.add_n),
         litert=litert.add_n,
         elementwise=True,
     ),

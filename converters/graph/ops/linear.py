@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from converters.graph.nodes import Node
-from converters.graph.ops.activations import FUSED, NN_KINDS, apply_activations, lower_activated
+from converters.graph.ops.activations import (
+    FUSED,
+    LITERT_OPERATORS,
+    LOOPS,
+    NN_KINDS,
+    apply_activations,
+    lower_activated,
+)
 from converters.graph.ops.barracuda import layers as nn
 from converters.graph.ops.barracuda.base import Nn
 from converters.graph.ops.barracuda.elementwise import pair
@@ -153,8 +161,8 @@ def _dense(name: str, kernel: Kernel, lower: Lower, attrs: Sequence[Attr], **tra
         kernel,
         lower,
         attrs,
-        litert=litert_matmul,
-        loops=loops.matmul,
+        litert=partial(litert_matmul, known=LITERT_OPERATORS),
+        loops=partial(loops.matmul, known=LOOPS),
         foldable=False,
         precision="summed",
         layer="dense",

@@ -29,7 +29,7 @@ from converters.graph.ops.base import (
 from converters.graph.ops.litert.base import Litert, builtin
 from converters.graph.ops.litert.elementwise import select
 from converters.graph.ops.loops import elementwise as loops
-from converters.graph.ops.loops.base import Loops, elementwise, simple
+from converters.graph.ops.loops.base import Elementwise, Loops, simple
 from converters.graph.ops.older import select_v2
 from converters.graph.ops.rewriting import GraphBuilder
 from converters.graph.types import BOOL, Symbols, TensorType
@@ -111,7 +111,7 @@ OPS = (
         direct("Greater"),
         compare(LayerType.GREATER),
         builtin("GREATER"),
-        elementwise(loops.greater),
+        Elementwise(loops.greater),
     ),
     # The other way round: Barracuda has no GreaterOrEqual.
     _comparison(
@@ -120,7 +120,7 @@ OPS = (
         direct("LessOrEqual", 1, 0),
         compare(LayerType.GREATER_EQUAL),
         builtin("GREATER_EQUAL"),
-        elementwise(loops.greater_equal),
+        Elementwise(loops.greater_equal),
     ),
     _comparison(
         "Equal", np.equal, direct("Equal"), compare(LayerType.EQUAL), builtin("EQUAL"), loops.comparison_loops("equal")
@@ -131,7 +131,7 @@ OPS = (
         chain(("Equal", None), ("Not", None)),
         compare(LayerType.EQUAL, negated=True),
         builtin("NOT_EQUAL"),
-        elementwise(loops.not_equal),
+        Elementwise(loops.not_equal),
     ),
     *(
         OpDef(

@@ -6,10 +6,11 @@ as the fields of their options. Every result is given its dtype and shape: those
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
+from msgspec import Struct
 
 from converters.graph.nodes import Node
 from converters.graph.types import INT32, INT64, Dim, TensorType
@@ -54,9 +55,27 @@ class LitertBuilder(Protocol):
 Litert = Callable[[Node, LitertBuilder], Any]
 
 
-def builtin(op: str, **options: Any) -> Litert:
+class Operator(Struct, frozen=True):
+    """A node as the operator ``op`` of all inputs.
+
+    One that is ``applied`` is a part of the operator before it, where that has one to apply it.
+    """
+
+    op: str
+    options: Mapping[str, Any] = {}
+    applied: bool = False
+
+    def __call__(self, node: Node, builder: LitertBuilder) -> Value:
+        """The value of a node's result."""
+        found = builder.activated(node.inputs[0], self.op) if self.applied else None
+        if found is not None:
+            return found
+        return builder.emit(self.op, [builder.value(r) for r in node.inputs], **self.options)
+
+
+def builtin(op: str, **options: Any) -> Operator:
     """The operator ``op`` of all inputs."""
-    return lambda node, builder: builder.emit(op, [builder.value(r) for r in node.inputs], **options)
+    return Operator(op, options)
 
 
 def same(node: Node, builder: LitertBuilder) -> Value:

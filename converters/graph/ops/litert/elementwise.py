@@ -9,16 +9,6 @@ from converters.graph.ops.litert.base import Litert, LitertBuilder, Value, numbe
 from converters.graph.types import BOOL, FLOAT32, INT32, INT64, TensorType
 
 
-def activation(function: str) -> Litert:
-    """A part of the operator before it where that has one, else an operator of its own."""
-
-    def lower(node: Node, builder: LitertBuilder) -> Value:
-        found = builder.activated(node.inputs[0], function)
-        return builder.emit(function, [builder.value(node.inputs[0])]) if found is None else found
-
-    return lower
-
-
 def square(node: Node, builder: LitertBuilder) -> Value:
     """Of the operand, or of the difference of two; whole numbers by MUL, which has them."""
     values = [builder.value(r) for r in node.inputs]

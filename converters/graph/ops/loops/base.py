@@ -173,22 +173,23 @@ def shape_of(node: Node, builder: LoopBuilder, output: str = "") -> tuple[int, .
     return tuple(int(n) for n in shape)
 
 
-def elementwise(function: Callable[..., Expression]) -> Loops:
-    """Each element is ``function`` of the operands' elements."""
+class Elementwise(Struct, frozen=True):
+    """Loops of which each element is ``function`` of the operands' elements."""
 
-    def loops(node: Node, builder: LoopBuilder) -> Tensor:
+    function: Callable[..., Expression]
+
+    def __call__(self, node: Node, builder: LoopBuilder) -> Tensor:
+        """The tensor of a node."""
         values = [builder.value(r) for r in node.inputs]
         kind = builder.type_of(node.name)
         return builder.compute(
-            shape_of(node, builder), lambda at: function(*(element(v, at) for v in values)), kind.dtype
+            shape_of(node, builder), lambda at: self.function(*(element(v, at) for v in values)), kind.dtype
         )
 
-    return loops
 
-
-def simple(name: str) -> Loops:
+def simple(name: str) -> Elementwise:
     """A function of the language of all operands' elements."""
-    return elementwise(lambda *x: apply(name, *x))
+    return Elementwise(lambda *x: apply(name, *x))
 
 
 def view(node: Node, builder: LoopBuilder) -> Tensor:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from converters.graph.nodes import Node
 from converters.graph.ops.loops.base import (
+    Elementwise,
     Expression,
     LoopBuilder,
     Loops,
@@ -11,7 +14,6 @@ from converters.graph.ops.loops.base import (
     Tensor,
     apply,
     element,
-    elementwise,
     holds,
     select_expression,
     shape_of,
@@ -119,17 +121,13 @@ def not_equal(a: Expression, b: Expression) -> Expression:
 
 def comparison_loops(function: str) -> Loops:
     """A comparison, or one of truths."""
-    return elementwise(lambda a, b: holds(function, a, b))
+    return Elementwise(lambda a, b: holds(function, a, b))
 
 
-#: The activations that a fused product carries.
-ACTIVATIONS = {"Relu": relu, "Relu6": relu6, "Elu": elu, "Sigmoid": sigmoid}
-
-
-def apply_activations(node: Node, x: Expression) -> Expression:
-    """What the activations of a fused op make of an element."""
+def apply_activations(node: Node, x: Expression, known: Mapping[str, Elementwise]) -> Expression:
+    """What the activations of a fused op, ``known`` by the names of their ops, make of an element."""
     for name in node.attrs.get("fused_ops", ())[1:]:
-        x = ACTIVATIONS[name](x)
+        x = known[name].function(x)
     return x
 
 
@@ -142,7 +140,7 @@ def cast(node: Node, builder: LoopBuilder) -> Tensor:
             return x
         return not_equal(x, _like(x, 0)) if target == BOOL else apply("cast", x, dtype=target)
 
-    made: Tensor = elementwise(convert)(node, builder)
+    made: Tensor = Elementwise(convert)(node, builder)
     return made
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from converters.graph.nodes import Node
 from converters.graph.ops.loops.base import (
     Drawn,
     Element,
+    Elementwise,
     Expression,
     Index,
     Kind,
@@ -34,7 +35,7 @@ def _mul(a: Expression, b: Expression) -> Expression:
     return apply("mul", a, b)
 
 
-def matmul(node: Node, builder: LoopBuilder) -> Tensor:
+def matmul(node: Node, builder: LoopBuilder, *, known: Mapping[str, Elementwise]) -> Tensor:
     """A product, a bias where there is one, and the activations that the op carries."""
     a, b = (builder.value(r) for r in node.inputs[:2])
     bias = builder.value(node.inputs[2]) if len(node.inputs) > 2 else None
@@ -47,8 +48,9 @@ def matmul(node: Node, builder: LoopBuilder) -> Tensor:
             right = (at[-1], k[0]) if turned[1] else (k[0], at[-1])
             return _mul(element(a, (*at[:-2], *left)), element(b, (*at[:-2], *right)))
 
-        total = builder.reduce("sum", [inner], product, a.dtype)
-        return apply_activations(node, total if bias is None else apply("add", total, element(bias, at)))
+        total: Expression = builder.reduce("sum", [inner], product, a.dtype)
+        total = total if bias is None else apply("add", total, element(bias, at))
+        return apply_activations(node, total, known)
 
     return builder.compute(shape_of(node, builder), one, a.dtype)
 
@@ -89,7 +91,7 @@ def _windows(
     return place
 
 
-def convolution(node: Node, builder: LoopBuilder) -> Tensor:
+def convolution(node: Node, builder: LoopBuilder, *, known: Mapping[str, Elementwise]) -> Tensor:
     """The sum over a window and the channels, a bias and the activations that the op carries."""
     image, kernel = (builder.value(r) for r in node.inputs[:2])
     bias = builder.value(node.inputs[2]) if len(node.inputs) > 2 else None
@@ -102,8 +104,9 @@ def convolution(node: Node, builder: LoopBuilder) -> Tensor:
             x = x if inside is None else select_expression(inside, x, Number(0, image.dtype))
             return _mul(x, Element(kernel, (*k, at[3])))
 
-        total = builder.reduce("sum", kernel.shape[:3], product, image.dtype)
-        return apply_activations(node, total if bias is None else apply("add", total, element(bias, at)))
+        total: Expression = builder.reduce("sum", kernel.shape[:3], product, image.dtype)
+        total = total if bias is None else apply("add", total, element(bias, at))
+        return apply_activations(node, total, known)
 
     return builder.compute(shape_of(node, builder), one, image.dtype)
 
