@@ -174,11 +174,12 @@ def _are_many(sources: Sequence[Path], out: Path) -> bool:
 def _export_few(sources: Sequence[Path], job: ExportOptions, env: str | None, console: Console) -> None:
     """Export sources in this process, and leave with the status of what came of it."""
 
-    def check_fit(policy: Policy) -> None:
+    def check_fit(policies: Sequence[Policy]) -> None:
         if env is not None:
             from exporter.play.named import world_maker
 
-            world_maker(env, sources[0])(policy.signature)
+            for policy in policies:
+                world_maker(env, sources[0])(policy.signature)
 
     results, refused = _export_all(sources, job, console, check_fit)
     played: list[PlayReport] = [] if env is None else _play(env, sources[0], results, job, console)
@@ -201,7 +202,7 @@ def _status(results: Sequence[ExportResult], played: Sequence[PlayReport]) -> in
 
 
 def _export_all(
-    sources: Sequence[Path], job: ExportOptions, console: Console, understood: Callable[[Policy], object]
+    sources: Sequence[Path], job: ExportOptions, console: Console, understood: Callable[[Sequence[Policy]], object]
 ) -> tuple[list[ExportResult], list[ExportModelError]]:
     """Export sources one after the other, and print what came of each; return the results and what was refused."""
     from exporter.export.pipeline import export

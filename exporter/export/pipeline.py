@@ -269,14 +269,14 @@ def export(
     progress: Progress = lambda text: None,
     pool: RuntimePool | None = None,
     refused: Callable[[ExportModelError], None] | None = None,
-    understood: Callable[[Policy], object] = lambda policy: None,
+    understood: Callable[[Sequence[Policy]], object] = lambda policies: None,
 ) -> Iterator[ExportResult]:
     """Export every policy of every source, one after the other.
 
     A path is read (once, if it is given twice), a Source was read already. A source that is refused, or a file of a
     folder, does not stop the others: ``refused`` is told, by default the errors of all are raised in the end
     (``RefusedError`` where there are several). A disagreement is in the result, not an exception. A ``pool`` that is
-    given stays open, for callers that export many times. ``understood`` is called with each policy of a source before
+    given stays open, for callers that export many times. ``understood`` is called with the policies of a source before
     the first is written; what it raises refuses the source.
     """
     if not paths:
@@ -299,8 +299,7 @@ def export(
             try:
                 with near(path) as here:
                     jobs = exporter.compile_source(here, names, told, path, apart)
-                    for job in jobs:
-                        understood(job.policy)
+                    understood([job.policy for job in jobs])
                     for result in exporter.write_jobs(jobs, pool, told):
                         done += 1
                         yield result

@@ -14,6 +14,7 @@ from converters.files.children.process import RunFailedError
 from converters.files.folders import scratch_folder
 from converters.formats.bundle.bundle import Bundle
 from converters.formats.source import ReadOptions
+from converters.policy.policy import Policy
 from converters.runtimes.pool import RuntimePool
 from exporter.compare.comparison import CompareOptions, compare_artefacts
 from exporter.export.options import ExportOptions
@@ -70,8 +71,10 @@ def play_policy(
                 Bundle.open(place).verify_hashes()
         first, *others = whole
         match = Match(make, options)
-        if not others:
-            others = [first] if (first / POLICY).is_file() else [_export_bundle(first, understanding, read, opened)]
+        if not others and (first / POLICY).is_file():
+            others = [first]
+        elif not others:
+            others = [_export_bundle(first, understanding, read, opened, match.take_policy)]
         report = compare_artefacts(
             first,
             others,
@@ -106,18 +109,29 @@ def play_policy(
 
 
 def _export_bundle(
-    source: Path, understanding: CompileOptions | None, read: ReadOptions | None, opened: ExitStack
+    source: Path,
+    understanding: CompileOptions | None,
+    read: ReadOptions | None,
+    opened: ExitStack,
+    understood: Callable[[Policy], object],
 ) -> Path:
-    """Return a bundle of the formats that an export of a source writes, in a folder that goes when ``opened`` does."""
+    """Return a bundle of the formats that an export of a source writes, in a folder that goes when ``opened`` does.
+
+    ``understood`` is called with its one policy before any is written.
+    """
     folder = Path(opened.enter_context(scratch_folder()))
     options = ExportOptions(
         folder, compile=understanding or CompileOptions(), read=read or ReadOptions(), verify="none"
     )
-    results = list(export([source], options))
-    if len(results) != 1:
-        raise UsageError(
-            f"{source} holds {len(results)} policies",
-            why=", ".join(r.policy.name for r in results),
-            fix="choose one with --brain, or export it and give a bundle",
-        )
-    return results[0].folder
+
+    def check(policies: Sequence[Policy]) -> None:
+        if len(policies) != 1:
+            raise UsageError(
+                f"{source} holds {len(policies)} policies",
+                why=", ".join(p.name for p in policies),
+                fix="choose one with --brain, or export it and give a bundle",
+            )
+        understood(policies[0])
+
+    (result,) = export([source], options, understood=check)
+    return result.folder

@@ -221,6 +221,22 @@ def test_what_does_not_fit_is_refused_before_anything_runs(
     assert ran.status == 2 and says in ran.err and not ran.out
 
 
+@pytest.mark.parametrize(
+    ("source", "says"),
+    [("GridWorld", "the policy does not fit the environment"), ("twobrains", "holds 2 policies")],
+)
+def test_a_source_that_cannot_play_is_refused_before_it_is_exported(
+    source: str, says: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def write(*given: object) -> None:
+        raise AssertionError("an artefact was written")
+
+    monkeypatch.setattr("exporter.export.pipeline.artefacts_of", write)
+    path = trained.run_folder(source) if source == "GridWorld" else fixture(source)
+    ran = export_model("play", path, "--env", "3DBall")
+    assert ran.status == 2 and says in ran.err and not ran.out
+
+
 def test_a_bundle_that_was_changed_is_refused(bundles: Path, tmp_path: Path) -> None:
     import shutil
 
