@@ -90,10 +90,11 @@ def verdict(report: ParityReport) -> str:
 
 def reference_text(report: ParityReport) -> str:
     """Return what all was compared with, in words."""
-    if report.original is not None:
-        return f"the original in {runtime_title(report.original)}"
-    if "/" in report.reference:
-        return f"the bundle's own {WRITTEN[report.reference.partition('/')[0]].main_of('')}"
+    kind, _, runtime = report.reference.partition("/")
+    if report.original is not None or kind == "source":
+        return f"the original in {runtime_title(report.original or runtime)}"
+    if runtime:
+        return f"the bundle's own {WRITTEN[kind].main_of('')}"
     if report.self_consistent:
         return "export-model's reading of the original, which nothing else here can run"
     return "export-model's reading of the original, which was not run"
