@@ -71,10 +71,7 @@ def play_policy(
                 Bundle.open(place).verify_hashes()
         first, *others = whole
         match = Match(make, options)
-        if not others and (first / POLICY).is_file():
-            others = [first]
-        elif not others:
-            others = [_export_bundle(first, understanding, read, opened, match.take_policy)]
+        others = others or [_playable(first, understanding, read, opened, match.take_policy)]
         report = compare_artefacts(
             first,
             others,
@@ -108,17 +105,19 @@ def play_policy(
     return keep_record(first, played) if own else played
 
 
-def _export_bundle(
+def _playable(
     source: Path,
     understanding: CompileOptions | None,
     read: ReadOptions | None,
     opened: ExitStack,
     understood: Callable[[Policy], object],
 ) -> Path:
-    """Return a bundle of the formats that an export of a source writes, in a folder that goes when ``opened`` does.
+    """Return a bundle as it is, or one of the formats that an export of a source writes, gone when ``opened`` is.
 
-    ``understood`` is called with its one policy before any is written.
+    ``understood`` is called with a source's one policy before any format is written.
     """
+    if (source / POLICY).is_file():
+        return source
     folder = Path(opened.enter_context(scratch_folder()))
     options = ExportOptions(
         folder, compile=understanding or CompileOptions(), read=read or ReadOptions(), verify="none"
