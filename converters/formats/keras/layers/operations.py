@@ -25,6 +25,7 @@ from converters.graph.nn import choosing, reduction, trigonometry
 from converters.graph.nn.activations import Activation, celu, clip, elu, leaky_relu, scale_and_shift
 from converters.graph.nn.linear import matmul
 from converters.graph.ops.einsum import einsum
+from converters.graph.ops.table import TABLE
 from converters.graph.types import BOOL, FLOAT32, INT32
 from signatures.errors import UnsupportedOpError
 
@@ -143,7 +144,7 @@ def _reduce(step: Step, kind: str) -> str:
     keep = bool(argument(step, 2, "keepdims", False))
     if kind == "Mean":
         x = as_float(step, x)
-    elif kind in ("Sum", "Prod") and not b.is_float(x):
+    elif not TABLE[kind].exact and not b.is_float(x):  # sums and products
         x = b.cast(x, np.promote_types(b.dtype(x), INT32))
     return cast_to_setting(step, b.reduce(kind, x, axes, keep=keep))
 
