@@ -93,6 +93,64 @@ def window(op: str, layout: str, *, kernel: Array | None = None, **attrs: Any) -
     return read, {"x": TURNED}, oracle
 
 
+def in_groups(kernel: Array, **attrs: Any) -> Case:
+    nodes = [placeholder("x", (None, 7, 6, 4)), constant("k", kernel)]
+    made = node("y", "Conv2D", "x", "k", T=F32, **{"strides": (1, 1, 1, 1), "padding": "SAME", **attrs})
+    return [*nodes, made], {"x": floats(2, 7, 6, 4)}, None
+
+
+def dilated(op: str, kernel: Array, pads: Sequence[Any], crops: Sequence[Any], block: Sequence[int] = (2, 3)) -> Case:
+    """A dilated convolution as TensorFlow writes it."""
+    operands = {"block": block, "pads": pads, "crops": crops}
+    nodes = [placeholder("x", (None, 7, 6, 3)), constant("k", kernel)]
+    nodes += [constant(name, np.array(value, np.int32)) for name, value in operands.items()]
+    types = {"T": F32, "Tblock_shape": np.int32}
+    return (
+        [
+            *nodes,
+            node("rows", "SpaceToBatchND", "x", "block", "pads", Tpaddings=np.int32, **types),
+            node("made", op, "rows", "k", T=F32, strides=(1, 1, 1, 1), padding="VALID"),
+            node("y", "BatchToSpaceND", "made", "block", "crops", Tcrops=np.int32, **types),
+        ],
+        {"x": IMAGE},
+        None,
+    )
+
+
+def cut_into_blocks() -> Case:
+    operands = {"block": [2, 3], "pads": [[0, 1], [3, 0]]}
+    nodes = [placeholder("x", (None, 7, 6, 3)), *(constant(k, np.array(v, np.int32)) for k, v in operands.items())]
+    types = {"T": F32, "Tblock_shape": np.int32, "Tpaddings": np.int32}
+    return [*nodes, node("y", "SpaceToBatchND", "x", "block", "pads", **types)], {"x": IMAGE}, None
+
+
+def put_together() -> Case:
+    operands = {"block": [2, 3], "crops": [[0, 1], [3, 0]]}
+    nodes = [placeholder("x", (None, 3, 2, 3)), *(constant(k, np.array(v, np.int32)) for k, v in operands.items())]
+    types = {"T": F32, "Tblock_shape": np.int32, "Tcrops": np.int32}
+    return [*nodes, node("y", "BatchToSpaceND", "x", "block", "crops", **types)], {"x": floats(12, 3, 2, 3)}, None
+
+
+def dilated_sequence() -> Case:
+    nodes = [placeholder("x", (None, 9, 3)), constant("k", floats(1, 3, 3, 4)), constant("b", f32(1, 2, 3, 4))]
+    nodes += [constant("axis", -3), constant("block", np.array([2], np.int32))]
+    nodes += [constant("pads", np.array([[2, 3]], np.int32)), constant("crops", np.array([[0, 1]], np.int32))]
+    types = {"T": F32, "Tblock_shape": np.int32}
+    return (
+        [
+            *nodes,
+            node("rows", "SpaceToBatchND", "x", "block", "pads", Tpaddings=np.int32, **types),
+            node("image", "ExpandDims", "rows", "axis", T=F32, Tdim=np.int32),
+            node("made", "Conv2D", "image", "k", T=F32, strides=(1, 1, 1, 1), padding="VALID"),
+            node("biased", "BiasAdd", "made", "b", T=F32),
+            node("flat", "Squeeze", "biased", T=F32, squeeze_dims=(1,)),
+            node("y", "BatchToSpaceND", "flat", "block", "crops", Tcrops=np.int32, **types),
+        ],
+        {"x": floats(2, 9, 3)},
+        None,
+    )
+
+
 def explicit(op: str) -> Case:
     attrs = {"strides": (1, 2, 2, 1), "padding": "EXPLICIT", "explicit_paddings": (0, 0, 1, 2, 0, 3, 0, 0)}
     nodes = [placeholder("x", (None, 7, 6, 3)), constant("k", KERNEL)]
@@ -251,6 +309,15 @@ CASES: Mapping[str, Case] = {
     "MaxPool, NCHW": window("MaxPool", "NCHW", **POOLED),
     "AvgPool, NCHW": window("AvgPool", "NCHW", **POOLED),
     "BiasAdd, NCHW": binary("BiasAdd", TURNED, f32(1, 2, 3), data_format="NCHW"),
+    "Conv2D, two groups": in_groups(floats(3, 2, 2, 6), strides=(1, 2, 1, 1)),
+    "Conv2D, a group for each channel": in_groups(floats(2, 2, 1, 8), padding="VALID"),
+    "SpaceToBatchND": cut_into_blocks(),
+    "BatchToSpaceND, alone": put_together(),
+    "BatchToSpaceND": dilated("Conv2D", KERNEL, [[0, 1], [0, 0]], [[0, 1], [0, 0]]),
+    "BatchToSpaceND, SAME": dilated("Conv2D", KERNEL, [[2, 3], [3, 3]], [[0, 1], [0, 0]]),
+    "BatchToSpaceND, more cut off than was added": dilated("Conv2D", KERNEL, [[0, 1], [3, 3]], [[1, 1], [4, 0]]),
+    "BatchToSpaceND, each channel": dilated("DepthwiseConv2dNative", KERNEL, [[0, 1], [0, 0]], [[0, 1], [0, 0]]),
+    "BatchToSpaceND, a sequence": dilated_sequence(),
     "Conv2D, EXPLICIT": explicit("Conv2D"),
     "DepthwiseConv2dNative, EXPLICIT": explicit("DepthwiseConv2dNative"),
     "PlaceholderWithDefault": with_default(),
@@ -330,6 +397,12 @@ REFUSED: Mapping[str, Sequence[Any]] = {
         placeholder("x", (None, 3)),
         placeholder("i", (1,), np.int32),
         node("y", "ReverseV2", "x", "i"),
+    ],
+    "its blocks are": [
+        placeholder("x", (None, 2, 2, 3)),
+        constant("block", np.array([0, 2], np.int32)),
+        constant("crops", np.zeros((2, 2), np.int32)),
+        node("y", "BatchToSpaceND", "x", "block", "crops", T=F32, Tblock_shape=np.int32, Tcrops=np.int32),
     ],
     "training mode": batch_norm("FusedBatchNormV3", IMAGE, is_training=True)[0],
 }

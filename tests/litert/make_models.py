@@ -45,6 +45,16 @@ def _keras(tf: Any) -> Iterator[tuple[str, Any]]:
     ):
         x = layer(x)
     yield "image", model(image, x)
+    image = x = given(12, 11, 4, name="visual_observation")
+    for layer in (
+        layers.Conv2D(6, 3, dilation_rate=2, activation="relu"),
+        layers.Conv2D(4, (2, 3), dilation_rate=3, padding="same", groups=2),
+        layers.DepthwiseConv2D(3, dilation_rate=2),
+        layers.Flatten(),
+        layers.Dense(4),
+    ):
+        x = layer(x)
+    yield "dilated", model(image, x)
     obs, h, c = given(8), given(16, name="h_in"), given(16, name="c_in")
     out, state = layers.LSTMCell(16)(obs, [h, c])
     yield "cell", model([obs, h, c], {"action": layers.Dense(2)(out), "h_out": state[0], "c_out": state[1]})
@@ -53,6 +63,9 @@ def _keras(tf: Any) -> Iterator[tuple[str, Any]]:
     steps = given(5, 8)
     x = layers.GlobalAveragePooling1D()(layers.MultiHeadAttention(2, 4)(steps, steps))
     yield "attention", model(steps, layers.Dense(2)(x))
+    steps = given(5, 8)
+    x = layers.Conv1D(4, 2, dilation_rate=2, padding="causal", activation="relu")(steps)
+    yield "conv1d-dilated", model(steps, layers.Dense(2)(layers.Flatten()(layers.Conv1D(3, 2, dilation_rate=2)(x))))
     steps = given(5, 8)
     yield "conv1d", model(steps, layers.Dense(2)(layers.Flatten()(layers.Conv1D(4, 2, activation="relu")(steps))))
 

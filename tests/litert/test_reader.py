@@ -86,7 +86,7 @@ def theirs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 READ = (
     *make_models.ACTIVATIONS,
-    *("softmax", "image", "cell", "gru", "attention", "conv1d", "halves"),
+    *("softmax", "image", "dilated", "cell", "gru", "attention", "conv1d", "conv1d-dilated", "halves"),
     *(f"saved-{name}" for name in make_models.SAVED),
     *(f"frozen-{name}" for name in make_models.FROZEN),
 )
@@ -122,6 +122,7 @@ def test_quantised_and_stateful_models_are_refused_by_name(name: str, theirs: Pa
 # ------------------------------------------------------------------ operators
 
 WINDOW = {"padding": 1, "stride_h": 1, "stride_w": 1}
+IMAGE_OF_4 = floats(1, 6, 5, 4)
 DILATED = {"dilation_h_factor": 1, "dilation_w_factor": 1}
 #: What the writer makes none of: operators of other tools, options, forms of operands.
 CASES: Mapping[str, tuple[Any, ...]] = {
@@ -135,6 +136,11 @@ CASES: Mapping[str, tuple[Any, ...]] = {
     "L2_NORMALIZATION": ("L2_NORMALIZATION", [X]),
     "LEAKY_RELU": ("LEAKY_RELU", [X], {"alpha": 0.3}),
     "PRELU": ("PRELU", [X, floats(4)]),
+    "CONV_2D in groups": ("CONV_2D", [IMAGE_OF_4, floats(6, 3, 3, 2), floats(6)], {**WINDOW, **DILATED, "stride_w": 2}),
+    "CONV_2D, each channel": ("CONV_2D", [IMAGE_OF_4, floats(4, 3, 3, 1), floats(4)], {**WINDOW, **DILATED}),
+    "REVERSE_V2": ("REVERSE_V2", [X, ints(1)]),
+    "SPACE_TO_BATCH_ND": ("SPACE_TO_BATCH_ND", [floats(2, 3, 6, 2), ints(2, 3), ints(1, 0, 2, 1).reshape(2, 2)]),
+    "BATCH_TO_SPACE_ND": ("BATCH_TO_SPACE_ND", [floats(12, 2, 2, 3), ints(2, 3), ints(1, 0, 0, 2).reshape(2, 2)]),
     "RANK": ("RANK", [X], {}, ("int32",)),
     "RELU_0_TO_1": ("RELU_0_TO_1", [X]),
     "RELU_N1_TO_1": ("RELU_N1_TO_1", [X]),

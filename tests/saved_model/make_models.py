@@ -213,7 +213,11 @@ def keras(folder: Path) -> None:
     model.save(folder / "policy.h5")
     model.export(folder / "exported")
     keep(folder, "keras", feeds, results)
-    h, last = tf.keras.Input([4], name="h_in"), tf.keras.layers.Dense(2, activation="sparse_plus", name="action")
+    h, linear = tf.keras.Input([4], name="h_in"), tf.keras.layers.Dense(2)
+
+    def last(x: Any) -> Any:  # an operation that Keras alone knows
+        return tf.keras.ops.threshold(linear(x), 0.0, 0.0)
+
     value, (after,) = tf.keras.layers.GRUCell(4)(observation, [h])
     beyond = tf.keras.Model([observation, h], {"action": last(value), "h_out": after})
     beyond.save(folder / "beyond.keras")
@@ -226,6 +230,27 @@ def keras(folder: Path) -> None:
     inside = tf.keras.Model(one, kept)
     inside.export(folder / "stateful", verbose=False)
     inside.save(folder / "kept.keras")
+
+
+def dilated(folder: Path) -> None:
+    """Convolutions as SpaceToBatchND and BatchToSpaceND, and in groups."""
+    layers = tf.keras.layers
+    image = x = tf.keras.Input([12, 11, 4], name="visual_observation_0")
+    for layer in (
+        layers.Conv2D(6, 3, dilation_rate=2, activation="relu"),
+        layers.Conv2D(4, (2, 3), dilation_rate=3, padding="same"),
+        layers.Conv2D(6, 3, groups=2),
+        layers.DepthwiseConv2D(2, dilation_rate=2),
+        layers.Reshape([-1, 6]),
+        layers.Conv1D(3, 3, dilation_rate=2, padding="causal", activation="tanh"),
+        layers.Flatten(),
+        layers.Dense(2, name="action"),
+    ):
+        x = layer(x)
+    model = tf.keras.Model(image, x)
+    model.export(folder / "dilated", verbose=False)
+    seen = np.abs(draw(3, 12, 11, 4))
+    keep(folder, "dilated", {"visual_observation_0": seen}, {"action": model(seen)})
 
 
 def history(folder: Path) -> None:
@@ -339,6 +364,7 @@ def saver(folder: Path) -> None:
 
 def main(folder: Path) -> None:
     history(folder)
+    dilated(folder)
     doubles(folder)
     saver(folder)
     tf2(folder)

@@ -32,11 +32,15 @@ OF_FUNCTIONS = {
     "doubles-cast": "doubles-cast",
 }
 TRUSTED = ReadOptions(trust_source=True)
-#: Read as data, Keras' own run beside it; and one whose activation Keras alone knows.
+#: Read as data, Keras' own run beside it; and one with an operation that Keras alone knows.
 WITH_KERAS = {"policy.keras": "keras", "policy.h5": "keras", "beyond.keras": "beyond"}
+#: Dilated convolutions, which TensorFlow writes as three ops; TensorFlow 1.4 has none.
+DILATED = {"dilated": "dilated"}
 
 
-@pytest.mark.parametrize(("name", "archive"), [*FLAT.items(), *OF_FUNCTIONS.items(), *WITH_KERAS.items()])
+@pytest.mark.parametrize(
+    ("name", "archive"), [*FLAT.items(), *OF_FUNCTIONS.items(), *WITH_KERAS.items(), *DILATED.items()]
+)
 def test_reads_what_tensorflow_computes(models: Path, name: str, archive: str) -> None:
     (policy,) = read_source(models / name, TRUSTED).policies()
     assert policy.name == Path(name).stem
@@ -49,6 +53,14 @@ def test_agrees_in_all_runtimes_with_the_original(models: Path, name: str, tmp_p
     assert result.report is not None
     assert result.report.passed is True, "\n".join(failure_lines(result.report))
     assert result.report.reference == "source/tensorflow"
+
+
+def test_dilated_convolutions_agree_where_they_can_run(models: Path, tmp_path: Path, pool: RuntimePool) -> None:
+    options = ExportOptions(tmp_path, ("onnx", "saved_model"), verify=("tensorflow", "onnxruntime"))
+    (result,) = export([models / "dilated"], options, pool=pool)
+    assert result.report is not None
+    assert result.report.passed is True, "\n".join(failure_lines(result.report))
+    assert [n.op for n in result.policy.graph.nodes].count("Conv2D") > 3
 
 
 @pytest.mark.parametrize("name", ["references", "resources"])
@@ -128,9 +140,7 @@ def test_what_is_not_installed_is_said(
 
 
 def test_keras_is_loaded_only_where_the_caller_trusts_it(models: Path) -> None:
-    with pytest.raises(
-        NotAPolicyError, match=r"'action' \(Dense\) is not read: its activation is 'sparse_plus'"
-    ) as caught:
+    with pytest.raises(NotAPolicyError, match=r"'threshold' is Threshold, which is not read as data") as caught:
         read_source(models / "beyond.keras")
     assert "--trust-source" in str(caught.value.fix)
 

@@ -14,6 +14,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from converters.graph.editor import Editor
+from converters.graph.nn.convolution import Window, conv2d
 from converters.graph.nodes import Graph, Node, TensorShape
 from converters.graph.ops.base import MISFIT, REQUIRED, Attr, AttrKind, misfit
 from converters.graph.ops.older import TO_NCHW, TO_NHWC
@@ -129,8 +130,30 @@ def _take(editor: Editor, node: Node) -> None:
             issues=[(node.name, node.op)],
             why="only NHWC and NCHW images occur in policies",
         )
+    elif node.op == "Conv2D" and (parts := _split_groups(editor, node)):
+        editor.redirect(node.name, parts)
     else:
         editor.keep(node)
+
+
+def _split_groups(editor: Editor, node: Node) -> str:
+    """A convolution in groups, whose kernel takes a part of the channels, as one per group; "" for any other."""
+    shapes = [editor.shape_of(r) for r in node.inputs]
+    image, kernel = ([n for n in s or () if isinstance(n, int)] for s in shapes)
+    if len(kernel) != 4 or not image or shapes[0] is None or shapes[0][-1] != image[-1]:
+        return ""
+    height, width, taken, _ = kernel
+    if image[-1] == taken or not taken or image[-1] % taken:
+        return ""
+    (_, down, across, _), (_, *dilations, _) = node.attrs["strides"], node.attrs["dilations"]
+    same, groups = node.attrs["padding"] == "SAME", image[-1] // taken
+    window = Window((height, width), (down, across), (dilations[0], dilations[1]), same=same)
+    try:
+        (made,) = editor.write(node.inputs, lambda b, x, k: [conv2d(b, x, k, window, groups)], node.name)
+    except UnsupportedOpError as error:
+        what = f"cannot convert Conv2D (node {node.name!r}): {error.what}"
+        raise UnsupportedOpError(what, issues=[(node.name, node.op)], why=error.why) from error
+    return made
 
 
 def _draw_int64(editor: Editor, node: Node) -> None:

@@ -133,6 +133,7 @@ ARG_MAX 56 ArgMaxOptions fib b=3
 ARG_MIN 79 ArgMinOptions fib b=3
 AVERAGE_POOL_2D 1 Pool2DOptions f
 BATCH_MATMUL 126 BatchMatMulOptions f
+BATCH_TO_SPACE_ND 37 - -
 BROADCAST_TO 130 - -
 CAST 53 CastOptions *
 CEIL 104 - f
@@ -196,6 +197,7 @@ RELU6 21 - f
 RELU_0_TO_1 152 - -
 RELU_N1_TO_1 20 - -
 RESHAPE 22 ReshapeOptions *
+REVERSE_V2 105 - -
 ROUND 116 - f
 RSQRT 76 - f
 SELECT 64 - filub @1
@@ -205,6 +207,7 @@ SIGN 158 - fi i=2
 SIN 66 - f
 SLICE 65 - filub
 SOFTMAX 25 SoftmaxOptions f
+SPACE_TO_BATCH_ND 38 - -
 SPARSE_TO_DENSE 68 - filu @2
 SPLIT 49 SplitOptions fi @1 i=3
 SPLIT_V 102 SplitVOptions fil
@@ -245,7 +248,6 @@ class Builtin(Struct, frozen=True):
 #: Operators that are neither written nor read, by the names that people know, for messages.
 _OTHERS = """
 ASSIGN_VARIABLE 144
-BATCH_TO_SPACE_ND 37
 BIDIRECTIONAL_SEQUENCE_LSTM 52
 CALL_ONCE 129
 CONV_3D 132
@@ -259,9 +261,7 @@ QUANTIZE 114
 READ_VARIABLE 143
 RESIZE_BILINEAR 23
 RESIZE_NEAREST_NEIGHBOR 97
-REVERSE_V2 105
 SCATTER_ND 122
-SPACE_TO_BATCH_ND 38
 SPACE_TO_DEPTH 26
 STABLEHLO_COMPOSITE 206
 SVDF 27

@@ -8,15 +8,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from converters.graph.builder import Builder
 from converters.graph.ops.loops.layers import window_padding
 from signatures.errors import UnsupportedOpError
+
+if TYPE_CHECKING:  # the op table, which the builder asks, writes dilated convolutions with these
+    from converters.graph.builder import Builder
 
 MAX_GROUPS = 256
 Pair = tuple[int, int]

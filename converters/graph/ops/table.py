@@ -9,6 +9,7 @@ from converters.graph.nodes import Node
 from converters.graph.ops import (
     activations,
     arrays,
+    blocks,
     convolution,
     elementwise,
     filling,
@@ -95,7 +96,7 @@ CALLING = CALLS | WHILES | IFS
 def _table() -> Mapping[str, OpDef]:
     table: dict[str, OpDef] = {}
     numbers = (elementwise, activations, logic, linear, convolution, reductions, samplers)
-    for module in (*numbers, arrays, joining, slicing, filling, places, older):
+    for module in (*numbers, arrays, joining, slicing, filling, places, older, blocks):
         for op in module.OPS:
             if op.name in table:
                 raise ValueError(f"op {op.name} stands twice in the table")

@@ -46,6 +46,14 @@ def _axis(op: Op, net: Importer, position: int) -> int:
     return int(value[0])
 
 
+def _reverse(op: Op, net: Importer) -> str:
+    x = op.need(0)
+    axes = {net.axis(x, int(a)) for a in net.needed_constant(op.need(1), "its axes").reshape(-1)}
+    for axis in sorted(axes):
+        x = net.slice(x, axis, None, None, -1)
+    return x
+
+
 def _expand_dims(op: Op, net: Importer) -> str:
     return net.add("ExpandDims", [op.need(0), net.ints(_axis(op, net, 1), "axis")])
 
@@ -191,6 +199,7 @@ OPS: Mapping[str, Translate] = {
     "RANGE": _range,
     "RANK": _rank,
     "RESHAPE": _reshape,
+    "REVERSE_V2": _reverse,
     "SHAPE": _shape,
     "SLICE": _slice,
     "SPARSE_TO_DENSE": _sparse_to_dense,

@@ -11,6 +11,7 @@ from converters.formats.litert.importer.operator import Op, Translate
 from converters.formats.litert.tensors import UNNAMED, Tensors, damaged_error
 from converters.formats.onnx.importer.importer import node_name
 from converters.graph.builder import Builder
+from converters.graph.nn.dilation import Blocks
 from converters.graph.nodes import NameScope, Node, TensorShape, ref
 from converters.graph.ops.base import MISFIT
 from signatures.errors import UnsupportedOpError
@@ -35,6 +36,8 @@ class Importer(Builder):
         self.widened = self.narrowed = False
         #: weights that have their axes in TensorFlow's order
         self.kernels: set[str] = set()
+        #: position of the node that cut a tensor into blocks → that tensor, and how
+        self.blocks: dict[int, tuple[str, Blocks]] = {}
         self._turned: dict[tuple[int, tuple[int, ...]], str] = {}
         for number, port in ports.items():
             self._input(number, port)

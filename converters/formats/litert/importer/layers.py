@@ -11,6 +11,9 @@ from converters.formats.litert.importer.elementwise import add_activation
 from converters.formats.litert.importer.importer import KERNELS, Importer
 from converters.formats.litert.importer.operator import Op, Translate
 from converters.formats.litert.schema import PADDINGS
+from converters.graph.nn.convolution import Window, conv2d
+from converters.graph.nn.dilation import Blocks, batch_to_space, blocks_of, convolve_dilated, space_to_batch
+from converters.graph.ops.blocks import find_convolution
 
 _PADDING = {number: name for name, number in PADDINGS.items()}
 
@@ -66,11 +69,14 @@ def _conv2d(op: Op, net: Importer) -> str:
     if kernel not in net.kernels:
         kernel = net.transpose(kernel, KERNELS[op.kind])
     channels, taken = net.length(image, 3), net.length(kernel, 2)
-    if channels != taken:
-        raise op.refusal(
-            f"its image has {channels} channels, and a filter takes {taken}", "filters in groups are not read"
-        )
-    return _with_bias(op, net, net.add("Conv2D", [image, kernel], **_dilated_windows(op)))
+    if channels == taken:
+        return _with_bias(op, net, net.add("Conv2D", [image, kernel], **_dilated_windows(op)))
+    if not taken or channels % taken:
+        raise op.refusal(f"its image has {channels} channels, and a filter takes {taken}")
+    attrs = _dilated_windows(op)
+    height, width = (net.length(kernel, i) for i in range(2))
+    window = Window((height, width), attrs["strides"][1:3], attrs["dilations"][1:3], same=attrs["padding"] == "SAME")
+    return _with_bias(op, net, conv2d(net, image, kernel, window, channels // taken))
 
 
 def _depthwise(op: Op, net: Importer) -> str:
@@ -82,6 +88,28 @@ def _depthwise(op: Op, net: Importer) -> str:
         raise op.refusal(f"its kernel {list(kernel.shape)} does not fit an image of {channels} channels")
     own = net.const(kernel.reshape(height, width, channels, results // channels), "kernel")
     return _with_bias(op, net, net.add("DepthwiseConv2dNative", [image, own], **_dilated_windows(op)))
+
+
+def _blocks(op: Op, net: Importer) -> Blocks:
+    return blocks_of(*(net.needed_constant(op.need(i), "its block") for i in (1, 2)))
+
+
+def _space_to_batch(op: Op, net: Importer) -> str:
+    blocks = _blocks(op, net)
+    made = space_to_batch(net, op.need(0), blocks)
+    net.blocks[net.position[made]] = op.need(0), blocks
+    return made
+
+
+def _batch_to_space(op: Op, net: Importer) -> str:
+    """The dilated convolution that the blocks were made for; without one they are put together."""
+    crops = _blocks(op, net)
+    found = find_convolution(net.producer, op.need(0))
+    at = -1 if found is None else net.position[found.rows.name]
+    if found is None or at not in net.blocks:
+        return batch_to_space(net, op.need(0), crops)
+    x, blocks = net.blocks[at]
+    return convolve_dilated(net, x, found.kernel, found.bias, blocks.without(crops), depthwise=found.depthwise)
 
 
 def _pool(kind: str) -> Translate:
@@ -103,10 +131,12 @@ def _pad(op: Op, net: Importer) -> str:
 OPS: Mapping[str, Translate] = {
     "AVERAGE_POOL_2D": _pool("AvgPool"),
     "BATCH_MATMUL": _batch_matmul,
+    "BATCH_TO_SPACE_ND": _batch_to_space,
     "CONV_2D": _conv2d,
     "DEPTHWISE_CONV_2D": _depthwise,
     "FULLY_CONNECTED": _fully_connected,
     "MAX_POOL_2D": _pool("MaxPool"),
     "PAD": _pad,
     "PADV2": _pad,
+    "SPACE_TO_BATCH_ND": _space_to_batch,
 }
