@@ -15,6 +15,7 @@ from msgspec.structs import replace
 
 from converters.graph.nodes import Graph, Node, node_of
 from converters.graph.ops.table import CONTROL_FLOW, is_fed, passes_on, traits
+from converters.policy.action_values import says_action
 from converters.policy.given_outputs import check_given, outputs_from_user
 from converters.policy.memories import looks_like_state
 from converters.policy.rules import Decision, Rule
@@ -109,6 +110,13 @@ _TOLD, _KNOWN, _DECLARED = "--output says so", "the format says so", "the format
 _BEST = "it is the only choice of the best beside the values of actions"
 _BY_NAME = "its name is that of {} in ML-Agents' files and this tool's"
 _ALONE = "it is the only tensor made from an observation that nothing reads"
+#: Asked where the format declares outputs.
+_DECLARED_ACTIONS: tuple[Rule[tuple[Graph, Node], Role], ...] = (
+    Rule(Role.ACTION, lambda s: _is_choice(*s), "it is a choice, the best of some scores or drawn from them"),
+    Rule(
+        Role.ACTION, lambda s: says_action(s[1].name), "its name is that of an action, or of the mean or scores of one"
+    ),
+)
 #: Which tensors may be the action, where none is called so: the one that the first of these holds for.
 _ACTIONS: tuple[Rule[tuple[Graph, Node], Role], ...] = (
     Rule(
@@ -121,8 +129,6 @@ _ACTIONS: tuple[Rule[tuple[Graph, Node], Role], ...] = (
         lambda s: Q_NAMES.fullmatch(plain_name(s[1].name)) is not None,
         "its name is that of the values of actions",
     ),
-    # asked where the format declares outputs
-    Rule(Role.ACTION, lambda s: _is_choice(*s), "it is a choice, the best of some scores or drawn from them"),
 )
 
 
@@ -364,7 +370,7 @@ def _likely(graph: Graph, sinks: Sequence[Node], *, declared: bool) -> tuple[lis
     """The tensors that may be the action, and why they may."""
     if len(sinks) == 1:
         return [*sinks], _ALONE
-    for rule in _ACTIONS if declared else _ACTIONS[:-1]:
+    for rule in (*_ACTIONS, *_DECLARED_ACTIONS) if declared else _ACTIONS:
         fitting = [n for n in sinks if rule.when((graph, n))]
         if fitting:
             return fitting, rule.says

@@ -36,6 +36,13 @@ def dueling() -> Any:
     return keras.Model(x, value + (advantage - keras.ops.mean(advantage, axis=1, keepdims=True)))
 
 
+def heads(**layers: Any) -> Any:
+    """Several outputs of one network, by the names that their layers have."""
+    x = keras.Input([4])
+    h = k.Dense(8, **HIDDEN)(x)
+    return keras.Model(x, [k.Dense(size, activation=how, name=name)(h) for name, (size, how) in layers.items()])
+
+
 def main(folder: Path) -> None:
     keras.utils.set_random_seed(5)
     made = {
@@ -56,7 +63,22 @@ def main(folder: Path) -> None:
         "critic": chain(k.Dense(1, name="value"), "mse"),
         "called": chain(k.Dense(1, name="last"), name="critic"),
     }
+    several = {
+        "probs": heads(value=(1, None), probs=(3, "softmax")),
+        "logits": heads(logits=(3, None), value=(1, None)),
+        "policy": heads(policy=(3, "softmax"), critic=(1, None)),
+        "mu": heads(mu=(3, "tanh"), log_std=(3, None)),
+    }
+    for name, model in several.items():
+        model.save(folder / f"{name}.keras")
+        model.save(folder / f"{name}.h5")
+        keras.Model(model.inputs, dict(zip(model.output_names, model.outputs, strict=True))).export(
+            folder / name, verbose=False
+        )
     observed = np.random.default_rng(3).standard_normal((64, 4)).astype(np.float32) * 2
+    for name, model in several.items():
+        answers = dict(zip(model.output_names, model.predict(observed, verbose=0), strict=True))
+        np.savez(folder / f"{name}.npz", observed=observed, answered=answers[name])
     for name, model in [*made.items(), ("dueling", dueling())]:
         model.save(folder / f"{name}.keras")
         if name != "dueling":  # an operation without a name of its own cannot be saved as HDF5

@@ -85,6 +85,17 @@ def test_other_policies_stay_what_they_are(name: str, role: str, networks: Path)
     assert signature.notes == ()
 
 
+@pytest.mark.parametrize("kind", [".keras", ".h5", ""])
+@pytest.mark.parametrize("name", ["probs", "logits", "policy", "mu"])
+def test_the_action_of_several_outputs_is_told_by_its_name(name: str, kind: str, networks: Path) -> None:
+    """As a SavedModel, the outputs are the keys of a dictionary."""
+    policy = compiled(networks / f"{name}{kind}")
+    with np.load(networks / f"{name}.npz") as kept:
+        observed, answered = kept["observed"], kept["answered"]
+    made = run_graph(policy.graph, {"state": observed}, ["action"])["action"]
+    np.testing.assert_allclose(made, answered, rtol=1e-5, atol=1e-6)
+
+
 @pytest.mark.parametrize("file", ["critic.keras", "critic.h5", "called.keras"])
 def test_a_critic_is_not_a_policy(file: str, networks: Path) -> None:
     with pytest.raises(NotAPolicyError, match="is a value"):

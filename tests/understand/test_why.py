@@ -15,7 +15,7 @@ from converters.compiler.compile import explanations
 from converters.formats.onnx.output_roles import _BESIDE, _BY_NAME, output_roles
 from converters.formats.onnx.reader import OnnxModel
 from converters.graph.nodes import Graph, Node
-from converters.policy.brains import _ACTIONS, explain_outputs, find_brains
+from converters.policy.brains import _ACTIONS, _DECLARED_ACTIONS, explain_outputs, find_brains
 from converters.policy.input_rules import BY_NAME, BY_READERS, LAST_RESORTS
 from converters.policy.inputs import classify_inputs, explain_inputs
 from converters.policy.rules import Decision
@@ -188,6 +188,7 @@ _BY_NAME_OF_MEAN = next(rule.says for rule in _BY_NAME if "the mean or the score
         ([op("net/policy", "Tanh", "obs_0"), op("net/other", "Tanh", "obs_0")], False, 0),
         ([op("net/q_values_1", "Tanh", "obs_0"), op("net/other", "Tanh", "obs_0")], False, 1),
         ([constant("axis", 1), op("best", "ArgMax", "obs_0", "axis"), op("other", "Tanh", "obs_0")], True, 2),
+        ([op("net/mu", "Tanh", "obs_0"), op("net/other", "Tanh", "obs_0")], True, 3),
     ],
 )
 def test_every_rule_on_nameless_actions_decides(nodes: list[Node], declared: bool, number: int) -> None:
@@ -195,7 +196,7 @@ def test_every_rule_on_nameless_actions_decides(nodes: list[Node], declared: boo
     outputs = {n.name: None for n in nodes if n.value is None}
     (brain,) = find_brains(g, declared=outputs if declared else None)
     action = next(d for d in explain_outputs(brain, {}) if d.role is Role.ACTION)
-    assert action.says == _ACTIONS[number].says
+    assert action.says == (*_ACTIONS, *_DECLARED_ACTIONS)[number].says
 
 
 # ------------------------------------------------------------------ files
