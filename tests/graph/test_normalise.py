@@ -151,6 +151,21 @@ def dilated_sequence() -> Case:
     )
 
 
+def transposed(result: Sequence[int], **attrs: Any) -> Case:
+    """The batch is computed, as Keras does."""
+    nodes = [placeholder("x", (None, 5, 4, 3)), constant("k", floats(3, 4, 2, 3)), constant("axis", 0)]
+    nodes += [constant(f"n{i}", n) for i, n in enumerate((*result, 2))]
+    nodes += [constant(name, np.array([n], np.int32)) for name, n in (("begin", 0), ("end", 1), ("step", 1))]
+    numbers = {"T": np.int32, "Index": np.int32}
+    nodes += [
+        node("shape", "Shape", "x", T=F32, out_type=np.int32),
+        node("rows", "StridedSlice", "shape", "begin", "end", "step", shrink_axis_mask=1, **numbers),
+        node("sizes", "Pack", "rows", "n0", "n1", "n2", T=np.int32, N=4, axis=0),
+    ]
+    made = node("y", "Conv2DBackpropInput", "sizes", "k", "x", T=F32, **{"padding": "SAME", **attrs})
+    return [*nodes, made], {"x": floats(2, 5, 4, 3)}, None
+
+
 def explicit(op: str) -> Case:
     attrs = {"strides": (1, 2, 2, 1), "padding": "EXPLICIT", "explicit_paddings": (0, 0, 1, 2, 0, 3, 0, 0)}
     nodes = [placeholder("x", (None, 7, 6, 3)), constant("k", KERNEL)]
@@ -311,6 +326,11 @@ CASES: Mapping[str, Case] = {
     "BiasAdd, NCHW": binary("BiasAdd", TURNED, f32(1, 2, 3), data_format="NCHW"),
     "Conv2D, two groups": in_groups(floats(3, 2, 2, 6), strides=(1, 2, 1, 1)),
     "Conv2D, a group for each channel": in_groups(floats(2, 2, 1, 8), padding="VALID"),
+    "Conv2DBackpropInput": transposed((10, 8), strides=(1, 2, 2, 1)),
+    "Conv2DBackpropInput, an odd size": transposed((9, 7), strides=(1, 2, 2, 1)),
+    "Conv2DBackpropInput, VALID": transposed((11, 10), strides=(1, 2, 2, 1), padding="VALID"),
+    "Conv2DBackpropInput, VALID and more": transposed((12, 11), strides=(1, 2, 2, 1), padding="VALID"),
+    "Conv2DBackpropInput, wide strides": transposed((20, 12), strides=(1, 4, 3, 1)),
     "SpaceToBatchND": cut_into_blocks(),
     "BatchToSpaceND, alone": put_together(),
     "BatchToSpaceND": dilated("Conv2D", KERNEL, [[0, 1], [0, 0]], [[0, 1], [0, 0]]),

@@ -24,14 +24,16 @@ def model_of(
     inputs: Sequence[np.ndarray],
     results: Sequence[str] = ("float32",),
     fed: int = 1,
+    first: int = 0,
     **options: Any,
 ) -> Table:
-    """A model of one operator; the first ``fed`` operands are inputs of the model, the others constants."""
+    """A model of one operator; ``fed`` operands from ``first`` on are inputs of the model, the others constants."""
+    given = range(first, first + fed)
     buffers: list[Table] = [{}]
     tensors: list[Table] = []
     for number, array in enumerate(inputs):
         tensor: Table = {"type": TYPES[array.dtype][0], "name": f"in{number}", "shape": list(array.shape)}
-        if number >= fed:
+        if number not in given:
             tensor["buffer"] = len(buffers)
             buffers.append({"data": array})
         tensors.append(tensor)
@@ -49,7 +51,7 @@ def model_of(
     return {
         "version": 3,
         "operator_codes": [code],
-        "subgraphs": [{"tensors": tensors, "inputs": [*range(fed)], "outputs": outputs, "operators": [operator]}],
+        "subgraphs": [{"tensors": tensors, "inputs": [*given], "outputs": outputs, "operators": [operator]}],
         "buffers": buffers,
     }
 
@@ -58,7 +60,7 @@ def graph_of(model: Table) -> Any:
     return read_litert(encode(model).to_bytes()).graph
 
 
-def answers(model: Table, feeds: Sequence[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+def answers(model: Table, feeds: Sequence[np.ndarray], first: int = 0) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """(what the numpy kernels make of the graph that is read, what LiteRT's own make of the file)."""
     data = encode(model).to_bytes()
     runner = interpreter.Interpreter(
@@ -75,7 +77,7 @@ def answers(model: Table, feeds: Sequence[np.ndarray]) -> tuple[list[np.ndarray]
 
     names = [t.name for t in found.signature.outputs.values()]
     graph = normalise(found.graph, [n.split(":")[0] for n in names])
-    given = {f"in{i}": array for i, array in enumerate(feeds)}
+    given = {f"in{i}": array for i, array in enumerate(feeds, first)}
     ours = run_graph(graph, given, names)
     return [ours[n] for n in names], theirs
 

@@ -38,6 +38,7 @@ _TABLES = {
     "dilation_h_factor:i32=1",
     "DepthwiseConv2DOptions": "padding:i8 stride_w:i32 stride_h:i32 depth_multiplier:i32 activation:i8 "
     "dilation_w_factor:i32=1 dilation_h_factor:i32=1",
+    "TransposeConvOptions": "padding:i8 stride_w:i32 stride_h:i32 activation:i8",
     "Pool2DOptions": "padding:i8 stride_w:i32 stride_h:i32 filter_width:i32 filter_height:i32 activation:i8",
     "FullyConnectedOptions": "activation:i8 weights_format:i8 keep_num_dims:bool asymmetric_quantize_inputs:bool",
     "SoftmaxOptions": "beta:f32",
@@ -70,6 +71,7 @@ OPTIONS: Mapping[str, int] = {
     "Conv2DOptions": 1,
     "DepthwiseConv2DOptions": 2,
     "Pool2DOptions": 5,
+    "TransposeConvOptions": 49,
     "FullyConnectedOptions": 8,
     "SoftmaxOptions": 9,
     "ConcatenationOptions": 10,
@@ -222,6 +224,7 @@ TANH 28 - f
 TILE 69 - filub
 TOPK_V2 48 - -
 TRANSPOSE 39 - filub b=3 >4=4
+TRANSPOSE_CONV 67 TransposeConvOptions -
 UNPACK 88 UnpackOptions fib b=3
 WHERE 109 - bfil
 ZEROS_LIKE 93 - fil
@@ -265,7 +268,6 @@ SCATTER_ND 122
 SPACE_TO_DEPTH 26
 STABLEHLO_COMPOSITE 206
 SVDF 27
-TRANSPOSE_CONV 67
 UNIDIRECTIONAL_SEQUENCE_LSTM 44
 UNIDIRECTIONAL_SEQUENCE_RNN 35
 VAR_HANDLE 142

@@ -125,6 +125,24 @@ def conv2d_transposed(
     return conv2d(b, image, turned, replace(window, strides=(1, 1), pads=((0, 0), (0, 0)), same=False), groups)
 
 
+def transposed_window(
+    size: Pair, strides: Pair, image: Sequence[int], result: Sequence[int], *, same: bool
+) -> tuple[Window, Pair]:
+    """(The window, the rows and columns behind) that make ``result`` pixels of ``image``, as TensorFlow pads.
+
+    Raises UnsupportedOpError where a plain convolution of the result would not give the image.
+    """
+    pads, extra = [], []
+    for k, s, n, whole in zip(size, strides, image, result, strict=True):
+        if n != (-(-whole // s) if same else (whole - k) // s + 1):
+            raise UnsupportedOpError(f"it makes {whole} pixels of {n}", why="the model is damaged")
+        over = (n - 1) * s + k - whole
+        before = max(over, 0) // 2 if same else 0
+        pads.append((before, max(over - before, 0)))
+        extra.append(max(before - over, 0))
+    return Window(size, strides, (1, 1), (pads[0], pads[1])), (extra[0], extra[1])
+
+
 def _spread(b: Builder, image: str, axis: int, stride: int) -> str:
     """``stride`` - 1 zeros after each pixel of an axis, on three axes: what is before, the zeros, what is behind."""
     if stride == 1:

@@ -21,6 +21,7 @@ from converters.graph.ops import (
     reductions,
     samplers,
     slicing,
+    transposed,
 )
 from converters.graph.ops.base import OpDef, written_as_older
 from signatures.errors import UnsupportedOpError
@@ -96,7 +97,7 @@ CALLING = CALLS | WHILES | IFS
 def _table() -> Mapping[str, OpDef]:
     table: dict[str, OpDef] = {}
     numbers = (elementwise, activations, logic, linear, convolution, reductions, samplers)
-    for module in (*numbers, arrays, joining, slicing, filling, places, older, blocks):
+    for module in (*numbers, arrays, joining, slicing, filling, places, older, blocks, transposed):
         for op in module.OPS:
             if op.name in table:
                 raise ValueError(f"op {op.name} stands twice in the table")

@@ -11,9 +11,10 @@ from converters.formats.litert.importer.elementwise import add_activation
 from converters.formats.litert.importer.importer import KERNELS, Importer
 from converters.formats.litert.importer.operator import Op, Translate
 from converters.formats.litert.schema import PADDINGS
-from converters.graph.nn.convolution import Window, conv2d
+from converters.graph.nn.convolution import Window, conv2d, conv2d_transposed, transposed_window
 from converters.graph.nn.dilation import Blocks, batch_to_space, blocks_of, convolve_dilated, space_to_batch
 from converters.graph.ops.blocks import find_convolution
+from converters.graph.ops.transposed import result_lengths
 
 _PADDING = {number: name for name, number in PADDINGS.items()}
 
@@ -90,6 +91,18 @@ def _depthwise(op: Op, net: Importer) -> str:
     return _with_bias(op, net, net.add("DepthwiseConv2dNative", [image, own], **_dilated_windows(op)))
 
 
+def _conv_transpose(op: Op, net: Importer) -> str:
+    """By filters [out, height, width, in]; the first operand is the size of the result."""
+    weights, image = net.needed_constant(op.need(1), "its kernel").transpose(1, 2, 3, 0), op.need(2)
+    result = result_lengths(net.producer, net.constant, op.need(0))
+    attrs, lengths = _windows(op), [net.length(image, i) for i in (1, 2)]
+    size, strides = (weights.shape[0], weights.shape[1]), attrs["strides"][1:3]
+    window, extra = transposed_window(size, strides, lengths, result, same=attrs["padding"] == "SAME")
+    value = conv2d_transposed(net, image, weights, window, extra)
+    bias = op.get(3)
+    return add_activation(op, net, value if bias is None else net.add("BiasAdd", [value, bias]))
+
+
 def _blocks(op: Op, net: Importer) -> Blocks:
     return blocks_of(*(net.needed_constant(op.need(i), "its block") for i in (1, 2)))
 
@@ -139,4 +152,5 @@ OPS: Mapping[str, Translate] = {
     "PAD": _pad,
     "PADV2": _pad,
     "SPACE_TO_BATCH_ND": _space_to_batch,
+    "TRANSPOSE_CONV": _conv_transpose,
 }
