@@ -178,6 +178,14 @@ MODELS: dict[str, Model] = {
             k.TimeDistributed(k.Conv1D(3, 2))(x),
         ],
     ),
+    "resized": of_one(
+        [9, 7, 2],
+        lambda x: [
+            *(k.Resizing(5, 4)(x), k.Resizing(12, 15)(x), k.Resizing(4, 14, interpolation="nearest")(x)),
+            *(k.CenterCrop(4, 4)(x), k.CenterCrop(9, 6)(x)),
+            *(k.UpSampling2D(2, interpolation="bilinear")(x), k.UpSampling2D((1, 3), interpolation="bilinear")(x)),
+        ],
+    ),
     "channels first": of_one(
         [2, 6, 7],
         lambda x: [

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from converters.compiler.passes.unroll import MAX_NODES
+from converters.formats.keras.layers.resizing import UNTRAINED
 from converters.formats.keras.layers.step import Step
 from converters.formats.keras.layers.table import LAYERS, OPERATIONS
 from converters.formats.keras.model import Layer, LayeredModel, Place, input_shape, tensors_in
@@ -170,7 +171,8 @@ class Network(Builder):
         """Raise UnknownLayerError where a layer is called or computes in a way that would be left out in silence."""
         flat = [v for a in args for v in (a if isinstance(a, list) else [a])]
         odd = [str(v)[:60] for v in flat if not isinstance(v, str | None)]
-        odd += [f"{k}={str(v)[:60]}" for k, v in kwargs.items() if v not in (None, False) and k not in _ARGUMENTS]
+        known = {*_ARGUMENTS, "training"} if layer.kind in UNTRAINED else _ARGUMENTS
+        odd += [f"{k}={str(v)[:60]}" for k, v in kwargs.items() if v not in (None, False) and k not in known]
         if odd and not layer.operation:  # an operation's are looked at when it is read
             raise UnknownLayerError(f"its layer {path!r} ({layer.kind}) is called with {', '.join(odd)}")
         policy = layer.config.get("dtype")

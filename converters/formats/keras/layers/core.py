@@ -14,7 +14,6 @@ from converters.formats.keras.layers.step import Step, Translate
 from converters.graph.nn.linear import matmul
 from converters.graph.ops.einsum import einsum
 from converters.graph.types import FLOAT32, INT32, Dim
-from signatures.errors import UnsupportedOpError
 
 
 def _dense(step: Step) -> str:
@@ -89,23 +88,6 @@ def _pad_or_crop(step: Step, key: str, sign: int) -> str:
         if sign < 0 and -a - z >= step.net.length(step.x, axis):
             raise step.damaged_error("leaves nothing of an axis")
     return step.net.pad(step.x, [(0, 0), (0, 0), *pairs] if first else [(0, 0), *pairs, (0, 0)])
-
-
-def _up_sampling(step: Step) -> str:
-    step.refuse_unless("interpolation", "nearest")
-    size = step.get("size", 2)
-    axes = step.rank - 2
-    counts = [int(size)] * axes if isinstance(size, int) else [int(n) for n in size]
-    first = 2 if step.get("data_format") == "channels_first" else 1
-    value = step.x
-    for axis, count in enumerate(counts, first):
-        length = step.net.length(value, axis)
-        if count * length > 1 << 16:
-            raise UnsupportedOpError(f"it makes {count * length} rows or columns")
-        step.net.room(count * length)
-        if count != 1:
-            value = step.net.take(value, np.repeat(np.arange(length), count).tolist(), axis)
-    return value
 
 
 # ------------------------------------------------------------------ several tensors
@@ -200,7 +182,6 @@ LAYERS: Mapping[str, Translate] = {
     "Permute": lambda s: s.net.transpose(s.x, [0, *(int(d) for d in s.get("dims"))]),
     **dict.fromkeys(("ZeroPadding1D", "ZeroPadding2D"), partial(_pad_or_crop, key="padding", sign=1)),
     **dict.fromkeys(("Cropping1D", "Cropping2D"), partial(_pad_or_crop, key="cropping", sign=-1)),
-    **dict.fromkeys(("UpSampling1D", "UpSampling2D"), _up_sampling),
     "Rescaling": _rescaling,
     "Normalization": _normalization,
 }

@@ -15,6 +15,7 @@ from converters.formats.keras.layers import (
     normalisation,
     operations,
     recurrent,
+    resizing,
 )
 from converters.formats.keras.layers.step import Step, Translate
 from converters.formats.keras.model import layer_of
@@ -61,6 +62,7 @@ LAYERS: Mapping[str, Translate] = {
     **recurrent.LAYERS,
     **attention.LAYERS,
     **encoding.LAYERS,
+    **resizing.LAYERS,
     "TimeDistributed": _time_distributed,
     "SpectralNormalization": _spectral_normalization,
 }
