@@ -244,6 +244,11 @@ def shape_of_both(a: Array, b: Array) -> Case:
     return [*nodes, *shapes, node("y", "BroadcastArgs", "sa", "sb", T=np.int32)], {"a": a, "b": b}, None
 
 
+def added_up(axis: int, **attrs: Any) -> Case:
+    nodes = [placeholder("x", (None, 3, 4)), constant("axis", axis)]
+    return [*nodes, node("y", "Cumsum", "x", "axis", T=F32, Tidx=np.int32, **attrs)], {"x": floats(2, 3, 4)}, None
+
+
 def turned(*axes: int) -> Case:
     nodes = [placeholder("x", (None, 3, 4)), constant("axes", np.array(axes, np.int32))]
     return [*nodes, node("y", "ReverseV2", "x", "axes", T=F32, Tidx=np.int32)], {"x": floats(2, 3, 4)}, None
@@ -305,6 +310,9 @@ CASES: Mapping[str, Case] = {
     "TopKV2, int32": largest(ints(2, 3, 5), 2),
     "TopKV2, float64": largest(floats(2, 5).astype(np.float64), 2),
     "TopKV2, int64 places": largest(floats(2, 5), 3, Tk=np.int32, index_type=np.int64),
+    "Cumsum": added_up(1),
+    "Cumsum, exclusive": added_up(-1, exclusive=True),
+    "Cumsum, in reverse": added_up(2, reverse=True, exclusive=True),
     "TopK": largest_of_old(floats(3, 6), 2),
     "Erfc": unary("Erfc"),
     "ReverseV2": turned(1),

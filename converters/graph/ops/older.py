@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from converters.graph.nn.choosing import top_k
+from converters.graph.nn.choosing import cumulate, last, moved_back, top_k
 from converters.graph.nodes import Node, TensorShape, normal_ref, ref
 from converters.graph.ops.base import Attr, OpDef, written_as_older
 from converters.graph.ops.einsum import einsum
 from converters.graph.ops.rewriting import GraphBuilder, Older, Shape
 from converters.graph.types import BOOL, FLOAT32, INT32
 from signatures.errors import UnsupportedOpError
+
+if TYPE_CHECKING:  # it asks the table of ops
+    from converters.graph.builder import Builder
 
 _MAX_AXIS = 7
 TO_NCHW, TO_NHWC = np.array([0, 3, 1, 2], INT32), np.array([0, 2, 3, 1], INT32)
@@ -235,6 +239,24 @@ def _top_k(builder: GraphBuilder, node: Node) -> str:
     return best
 
 
+def _cumulate(builder: GraphBuilder, node: Node) -> str:
+    """Cumsum, which not all targets have: each element with those before it, summed up."""
+    tensor, operand = (normal_ref(r) for r in node.inputs)
+    exclusive, reverse = (bool(node.attrs.get(key, False)) for key in ("exclusive", "reverse"))
+    try:
+        axis = int(builder.known_value(operand, "its axis").reshape(()))
+
+        def layer(b: Builder, x: str) -> list[str]:
+            made = cumulate(b, last(b, x, b.axis(x, axis)), exclusive=exclusive, reverse=reverse)
+            return [moved_back(b, made, b.axis(x, axis))]
+
+        (result,) = builder.write([tensor], layer, node.name)
+    except UnsupportedOpError as error:
+        what = f"cannot convert {node.op} (node {node.name!r}): {error.what}"
+        raise UnsupportedOpError(what, issues=[(node.name, node.op)], why=error.why) from error
+    return result
+
+
 def _reverse(builder: GraphBuilder, node: Node) -> str:
     """ReverseV2 of given axes, which no ONNX op is: a StridedSlice that goes backwards."""
     tensor, operand = node.inputs
@@ -296,6 +318,7 @@ OPS = (
     _op_written_older("IsFinite", _compared_with_largest("LessEqual")),
     _op_written_older("IsInf", _compared_with_largest("Greater")),
     _op_written_older("TopKV2", _top_k, "TopK"),
+    _op_written_older("Cumsum", _cumulate),
     _op_written_older("ReverseV2", _reverse),
     _op_written_older("BroadcastArgs", _broadcast_args),
     _op_written_older("RandomUniformInt", _uniform_int),
