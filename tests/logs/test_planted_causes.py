@@ -156,7 +156,11 @@ DEAR = {"visual", "Crawler2D"}
 @pytest.mark.parametrize(
     ("name", "seed", "drawn"),
     [
-        pytest.param(name, seed, drawn, id=f"{name}-{seed}-{'drawn' if drawn else 'deterministic'}")
+        pytest.param(
+            *(name, seed, drawn),
+            id=f"{name}-{seed}-{'drawn' if drawn else 'deterministic'}",
+            marks=[pytest.mark.slow] if drawn and name in DEAR else [],
+        )
         for name in POLICIES
         for seed in (1, 2)
         for drawn in (False, True)
