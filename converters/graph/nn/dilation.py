@@ -51,7 +51,9 @@ def space_to_batch(b: Builder, x: str, blocks: Blocks) -> str:
     for axis, factor in enumerate(blocks.factors, 1):
         length = b.length(x, axis)
         if length % factor:
-            raise UnsupportedOpError(f"{length} pixels are no blocks of {factor}", why="the model is damaged")
+            raise UnsupportedOpError(
+                f"its length of {length} must be a multiple of {factor}", why="it is cut into blocks"
+            )
         split += [length // factor, factor]
     rows, channels = b.shape(x)[0], b.shape(x)[-1]
     wide = b.reshape(x, (rows, *split, channels))

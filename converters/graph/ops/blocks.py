@@ -15,8 +15,7 @@ from converters.graph.nn.dilation import (
 )
 from converters.graph.nodes import Node, normal_ref
 from converters.graph.ops.base import OpDef, written_as_older
-from converters.graph.ops.rewriting import GraphBuilder, Older
-from signatures.errors import UnsupportedOpError
+from converters.graph.ops.rewriting import GraphBuilder, refuse_by_name
 
 _CONVOLUTIONS = ("Conv2D", "DepthwiseConv2dNative")
 #: What makes a sequence of an image of height 1, and an image of a sequence.
@@ -82,18 +81,7 @@ def _join(builder: GraphBuilder, node: Node) -> str:
     return made
 
 
-def _refuse_by_name(write: Callable[[GraphBuilder, Node], str]) -> Older:
-    def older(builder: GraphBuilder, node: Node) -> str:
-        try:
-            return write(builder, node)
-        except UnsupportedOpError as error:
-            what = f"cannot convert {node.op} (node {node.name!r}): {error.what}"
-            raise UnsupportedOpError(what, issues=[(node.name, node.op)], why=error.why) from error
-
-    return older
-
-
 OPS = (
-    OpDef("SpaceToBatchND", written_as_older, older=_refuse_by_name(_split)),
-    OpDef("BatchToSpaceND", written_as_older, older=_refuse_by_name(_join)),
+    OpDef("SpaceToBatchND", written_as_older, older=refuse_by_name(_split)),
+    OpDef("BatchToSpaceND", written_as_older, older=refuse_by_name(_join)),
 )

@@ -11,6 +11,7 @@ from msgspec import Struct
 
 from converters.graph.nodes import Node, SourceName
 from converters.graph.types import Dim, TensorType
+from signatures.errors import UnsupportedOpError
 
 #: A shape as far as it is known; a string is a free axis.
 Shape = Sequence[Dim] | None
@@ -56,6 +57,21 @@ class GraphBuilder(NodeBuilder, Protocol):
 
 #: A node as nodes of older ops, whose names begin with its own; returns the tensor that stands for its output 0.
 Older = Callable[[GraphBuilder, Node], str]
+
+
+def refuse_by_name(write: Older) -> Older:
+    """``write``, which raises UnsupportedOpError with its node and op for what a layer of ``graph/nn`` refuses."""
+
+    def older(builder: GraphBuilder, node: Node) -> str:
+        try:
+            return write(builder, node)
+        except UnsupportedOpError as error:
+            what = f"cannot convert {node.op} (node {node.name!r}): {error.what}"
+            raise UnsupportedOpError(what, issues=[(node.name, node.op)], why=error.why) from error
+
+    return older
+
+
 #: A node as TensorFlow.js computes it rightly: further nodes are added, the one that takes its place is returned.
 Tfjs = Callable[[GraphBuilder, Node, Mapping[str, TensorType]], Node]
 

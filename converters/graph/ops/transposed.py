@@ -9,7 +9,7 @@ import numpy as np
 from converters.graph.nn.convolution import conv2d_transposed, transposed_window
 from converters.graph.nodes import Node, normal_ref
 from converters.graph.ops.base import OpDef, written_as_older
-from converters.graph.ops.rewriting import GraphBuilder
+from converters.graph.ops.rewriting import GraphBuilder, refuse_by_name
 from signatures.errors import UnsupportedOpError
 
 
@@ -33,26 +33,25 @@ def _as_plain_convolution(builder: GraphBuilder, node: Node) -> str:
     def constant(reference: str) -> np.ndarray | None:
         return builder.constant_of(normal_ref(reference))
 
-    try:
-        result = result_lengths(lambda r: builder.producer(normal_ref(r)), constant, sizes)
-        weights = builder.known_value(kernel, "its kernel")
-        shape = builder.shape_of(image) or ()
-        lengths = [n for n in shape[1:3] if isinstance(n, int)]
-        if len(lengths) != 2 or weights.ndim != 4 or node.attrs.get("data_format", "NHWC") != "NHWC":
-            raise UnsupportedOpError("the size of its image is not known")
-        if {*node.attrs.get("dilations", (1,))} != {1} or node.attrs["padding"] not in ("SAME", "VALID"):
-            raise UnsupportedOpError(f"its padding is {node.attrs['padding']}, and its dilations are not read")
-        _, down, across, _ = node.attrs["strides"]
-        window, extra = transposed_window(
-            (weights.shape[0], weights.shape[1]), (down, across), lengths, result, same=node.attrs["padding"] == "SAME"
-        )
-        (made,) = builder.write(
-            [image], lambda b, x: [conv2d_transposed(b, x, weights.swapaxes(2, 3), window, extra)], node.name
-        )
-    except UnsupportedOpError as error:
-        what = f"cannot convert {node.op} (node {node.name!r}): {error.what}"
-        raise UnsupportedOpError(what, issues=[(node.name, node.op)], why=error.why) from error
+    result = result_lengths(lambda r: builder.producer(normal_ref(r)), constant, sizes)
+    weights = builder.known_value(kernel, "its kernel")
+    shape = builder.shape_of(image) or ()
+    lengths = [n for n in shape[1:3] if isinstance(n, int)]
+    if len(lengths) != 2 or weights.ndim != 4 or node.attrs.get("data_format", "NHWC") != "NHWC":
+        raise UnsupportedOpError("the size of its image is not known")
+    padding, dilations = node.attrs["padding"], {*node.attrs.get("dilations", (1,))}
+    if dilations != {1}:
+        raise UnsupportedOpError("its dilations are not read")
+    if padding not in ("SAME", "VALID"):
+        raise UnsupportedOpError(f"its padding is {padding}; it must be SAME or VALID")
+    _, down, across, _ = node.attrs["strides"]
+    window, extra = transposed_window(
+        (weights.shape[0], weights.shape[1]), (down, across), lengths, result, same=padding == "SAME"
+    )
+    (made,) = builder.write(
+        [image], lambda b, x: [conv2d_transposed(b, x, weights.swapaxes(2, 3), window, extra)], node.name
+    )
     return made
 
 
-OPS = (OpDef("Conv2DBackpropInput", written_as_older, older=_as_plain_convolution),)
+OPS = (OpDef("Conv2DBackpropInput", written_as_older, older=refuse_by_name(_as_plain_convolution)),)
