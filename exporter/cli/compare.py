@@ -55,7 +55,6 @@ def compare_command(
     from exporter.compare.comparison import CompareOptions, compare_artefacts
     from exporter.reports.entry import Entry
 
-    console.prepare()
     read: list[Policy] = []
     with console.progress() as progress:
         report = compare_artefacts(

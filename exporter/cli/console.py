@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -12,7 +13,7 @@ from msgspec import Struct
 
 from exporter.cli.group import FILE
 from exporter.cli.terminal import Bar, Progress, say, say_json, say_lines, say_paragraph
-from signatures.errors import UsageError
+from signatures.errors import ExportModelError, UsageError
 
 if TYPE_CHECKING:
     from exporter.export.pipeline import ExportResult
@@ -41,15 +42,20 @@ class Console(Struct, frozen=True):
     html: Path | None = None
     tolerances: Path | None = None
 
-    def prepare(self, *, verifies: bool = True) -> None:
+    def prepare(self) -> None:
         """Refuse what does not go together, before anything takes long. Raises UsageError."""
         if self.quiet and self.verbose:
             raise UsageError("--quiet and --verbose contradict each other", fix="give one of them")
         if self.as_json and self._markdown_on_stdout:
             raise UsageError("--json and --markdown - both want stdout", fix="give --markdown a file")
-        if not self.wants_reports:
-            return
-        if not verifies:
+        if self.wants_reports:
+            from exporter.reports.write import Destinations
+
+            Destinations(self.junit, self.markdown, self.html).prepare()
+
+    def check_verified(self, runtimes: str) -> None:
+        """Raise UsageError where reports are asked for on what no runtime verifies."""
+        if runtimes == "none" and self.wants_reports:
             asked = {"--junit": self.junit, "--markdown": self.markdown, "--html": self.html}
             given = [option for option, value in asked.items() if value is not None]
             raise UsageError(
@@ -57,9 +63,6 @@ class Console(Struct, frozen=True):
                 why="--verify none was given",
                 fix="leave one of them out",
             )
-        from exporter.reports.write import Destinations
-
-        Destinations(self.junit, self.markdown, self.html).prepare()
 
     @property
     def _markdown_on_stdout(self) -> bool:
@@ -103,12 +106,12 @@ class Console(Struct, frozen=True):
         """For the steps of a command; nothing where stdout is for a program and stderr should stay empty."""
         return Progress(quiet=self.quiet or self._silent, verbose=self.verbose)
 
-    def write_reports(self, entries: Callable[[], Sequence[Entry]]) -> None:
+    def write_reports(self, entries: Callable[[], Sequence[Entry]], refused: Sequence[ExportModelError] = ()) -> None:
         """Write the reports that were asked for; ``entries`` is not called where there are none."""
         if self.wants_reports:
             from exporter.reports.write import parity_documents
 
-            self.write_documents(parity_documents(functools.cache(entries)))
+            self.write_documents(parity_documents(functools.cache(entries), refused))
 
     def write_documents(self, documents: Documents) -> None:
         """Write the reports that were asked for."""
@@ -318,13 +321,22 @@ def _next(results: Sequence[ExportResult], sources: Sequence[Path]) -> list[str]
 
 
 def reporting(command: Callable[..., Any]) -> Callable[..., Any]:
-    """The options on output and reports; the command gets them as one ``console``."""
+    """The options on output and reports; the command gets them as one ``console``.
+
+    A command that ends in an error writes it into the reports.
+    """
 
     @functools.wraps(command)
     def call_with_console(*args: Any, **options: Any) -> Any:
         names = ("as_json", "quiet", "verbose", "junit", "markdown", "html", "tolerances")
         console = Console(**{name: options.pop(name) for name in names})
-        return command(*args, console=console, **options)
+        console.prepare()
+        try:
+            return command(*args, console=console, **options)
+        except ExportModelError as error:
+            with contextlib.suppress(UsageError):  # a file that cannot be written must not hide what happened
+                console.write_reports(list, [error])
+            raise
 
     for option in (
         click.option("--tolerances", type=FILE, metavar="FILE", help="Other tolerances, each with its reason (TOML)."),

@@ -135,7 +135,7 @@ def export_command(
     if profile == "help":
         console.profiles()
         return
-    console.prepare(verifies=runtimes != "none")
+    console.check_verified(runtimes)
     job = ExportOptions(
         out=out,
         targets=None if targets is None else [t for t in targets.split(",") if t],
@@ -187,7 +187,7 @@ def _export_few(sources: Sequence[Path], job: ExportOptions, env: str | None, co
     told: dict[str, object] = {"refused": [e.to_dict() for e in refused]} if refused else {}
     told |= {"play": [p.to_dict() for p in played]} if played else {}
     console.json({"policies": [r.to_dict() for r in results], **told})
-    console.write_reports(lambda: _entries(results, job.parity.steps, played))
+    console.write_reports(lambda: _entries(results, job.parity.steps, played), refused)
     console.next_step(results, job.compile.names, job.profile, sources)
     status = 2 if refused else _status(results, played)
     if status:

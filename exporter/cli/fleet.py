@@ -18,7 +18,7 @@ from exporter.fleet.fleet import export_fleet
 from exporter.fleet.sources import paths_text, sources_in
 from exporter.fleet.worker import Outcome, Wanted
 from exporter.tables import count_text
-from signatures.errors import UsageError
+from signatures.errors import ExportModelError, UsageError
 
 if TYPE_CHECKING:
     from exporter.export.options import ExportOptions
@@ -53,7 +53,7 @@ def run_fleet(
     entries: list[Entry] = []
     words = as_given(RULES)
     answers: list[Any] = []
-    refused: list[Any] = []
+    refused: list[ExportModelError] = []
     count = 1 if jobs is None else jobs
     outcomes = export_fleet(
         paths,
@@ -72,14 +72,15 @@ def run_fleet(
                 replace(p.entry, command=(*p.entry.command, *words)) for p in outcome.policies if p.entry is not None
             )
             answers.extend(p.answer for p in outcome.policies if p.answer is not None)
-            if outcome.error is not None and console.as_json:
-                refused.append(outcome.error.to_dict())
+            if outcome.error is not None and (console.as_json or console.wants_reports):
+                refused.append(outcome.error)
             if console.verbose:
                 for line in _lines(outcome):
                     say_lines(line)
-    console.json({"policies": answers, "unchanged": tally.unchanged, **({"refused": refused} if refused else {})})
+    told = {"refused": [e.to_dict() for e in refused]} if refused else {}
+    console.json({"policies": answers, "unchanged": tally.unchanged, **told})
     console.fleet(tally.failures, tally.summary)
-    console.write_reports(lambda: entries)
+    console.write_reports(lambda: entries, refused)
     if tally.refused:
         sys.exit(2)
     if tally.disagree:

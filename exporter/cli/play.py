@@ -79,7 +79,6 @@ def play_command(
     from exporter.play.play import play_policy
     from exporter.verify.options import VerifyOptions
 
-    console.prepare()
     options = PlayOptions(episodes, seed, margin, likeliest, most)
     with console.progress() as progress:
         report = play_policy(

@@ -71,7 +71,6 @@ def verify_command(
     from exporter.export.again import verify_folder
     from exporter.remote.fetching import nearby
 
-    console.prepare()
     if log is not None:
         from exporter.cli.logs import check_log_of
 
@@ -95,8 +94,9 @@ def verify_command(
         console.check_rules(reports)
         told = {"refused": [e.to_dict() for e in refused]} if refused else {}
         console.json({"reports": [r.to_dict() for r in reports], **told})
-        if reports:
-            console.write_reports(lambda: _bundle_entries(reports, [place for place, _ in verified], options.steps))
+        console.write_reports(
+            lambda: _bundle_entries(reports, [place for place, _ in verified], options.steps), refused
+        )
     if refused:
         sys.exit(2)
     if any(r.passed is False for r in reports):

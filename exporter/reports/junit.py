@@ -11,14 +11,25 @@ from collections.abc import Iterable, Sequence
 
 from converters.formats.registry import FORMATS
 from exporter.reports.entry import Entry
+from exporter.reports.refused import place_of
 from exporter.verify.findings import Failure, Finding
 from exporter.verify.plays import DIFFERENT, NOT_DECIDED, PlayRecord
+from signatures.errors import ExportModelError
 from signatures.fields import printable
 
 
-def junit_xml(entries: Sequence[Entry]) -> bytes:
-    """The whole file, UTF-8."""
-    return junit_file([suite for entry in entries for suite in suites_of(entry)])
+def junit_xml(entries: Sequence[Entry], refused: Sequence[ExportModelError] = ()) -> bytes:
+    """The whole file, UTF-8; what was refused has a suite with one error."""
+    return junit_file([*map(_refused_suite, refused), *(suite for entry in entries for suite in suites_of(entry))])
+
+
+def _refused_suite(error: ExportModelError) -> ET.Element:
+    suite = ET.Element("testsuite", name=_text(place_of(error)))
+    case = ET.SubElement(suite, "testcase", classname=_text(place_of(error)), name="refused")
+    kind = f"export-model.{type(error).__name__}"
+    ET.SubElement(case, "error", type=kind, message=_text(error.what)).text = _text(error.message)
+    count_cases(suite)
+    return suite
 
 
 def junit_file(suites: Sequence[ET.Element]) -> bytes:

@@ -6,9 +6,11 @@ import re
 from collections.abc import Iterable, Sequence
 
 from exporter.reports.entry import Entry
+from exporter.reports.refused import place_of
 from exporter.tables import size_with_original
 from exporter.verify.plays import CONFIDENCE, DIFFERENT, EQUIVALENT, NOT_DECIDED, PlayRecord
 from exporter.verify.report import ParityReport
+from signatures.errors import ExportModelError
 from signatures.fields import printable
 
 #: What the numbers of the table are.
@@ -19,13 +21,17 @@ _MARKS = {True: "✅", False: "❌", None: "⚠️"}
 PLAY_MARKS = {EQUIVALENT: _MARKS[True], DIFFERENT: _MARKS[False], NOT_DECIDED: _MARKS[None]}
 
 
-def markdown_text(entries: Sequence[Entry]) -> str:
-    """The whole document; failed policies come first."""
+def markdown_text(entries: Sequence[Entry], refused: Sequence[ExportModelError] = ()) -> str:
+    """The whole document; what was refused comes first, then failed policies."""
     ordered = sorted(entries, key=lambda e: (e.report.passed is not False, e.report.passed is not None))
     lines = ["## export-model", ""]
-    if len(entries) > 1:
-        rows = [[_mark(e.report), code(e.name), e.report.verdict, str(len(e.report.failures))] for e in ordered]
+    if len(entries) + len(refused) > 1:
+        rows = [[_MARKS[False], code(place_of(error)), "refused", "–"] for error in refused]
+        rows += [[_mark(e.report), code(e.name), e.report.verdict, str(len(e.report.failures))] for e in ordered]
         lines += [*markdown_table(("", "policy", "verdict", "disagreements"), rows), ""]
+    for error in refused:
+        said = [f"- {text(line)}" for line in error.message.splitlines()]
+        lines += [f"### {_MARKS[False]} {code(place_of(error))}", "", "REFUSED", "", *said, ""]
     for entry in ordered:
         lines += _policy(entry)
     return "\n".join(lines).rstrip() + "\n"

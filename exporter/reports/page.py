@@ -9,7 +9,9 @@ from exporter import __version__
 from exporter.reports import sections
 from exporter.reports.entry import Entry
 from exporter.reports.markup import Markup, el
+from exporter.reports.refused import place_of
 from exporter.verify.report import Pair
+from signatures.errors import ExportModelError
 
 _PARTS = Path(__file__).parent
 _CHIPS = {
@@ -18,6 +20,7 @@ _CHIPS = {
     "failed": ("failed", "Failed"),
     "not verified": ("unverified", "Not verified"),
 }
+_REFUSED = el("span", "Refused", class_="chip failed")
 #: How much of what is allowed a difference takes, as a colour of the overview.
 _HEAT = {
     "equal": "equal",
@@ -44,16 +47,19 @@ _SECTIONS: tuple[Callable[[Entry], Markup | None], ...] = (
 )
 
 
-def page(entries: Sequence[Entry]) -> str:
-    """The document for one or more policies."""
+def page(entries: Sequence[Entry], refused: Sequence[ExportModelError] = ()) -> str:
+    """The document for one or more policies, and for what was refused."""
     ordered = sorted(entries, key=lambda e: (e.report.passed is not False, e.report.passed is not None))
-    alone = len(ordered) == 1
+    names = [*map(place_of, refused), *(e.name for e in ordered)]
+    alone = len(names) == 1
     eyebrow = el("h1" if alone else "p", "export-model · parity report", class_="eyebrow")
-    title = f"{ordered[0].name}: parity report" if alone else f"Parity report on {len(ordered)} policies"
+    title = f"{names[0]}: parity report" if alone else f"Parity report on {len(ordered)} policies"
+    title += f", {len(refused)} refused" if refused and not alone else ""
     bundled = any(e.contract is not None for e in entries)
     data = " parity.json in the bundle holds the same as data." if bundled else ""
-    header = el("header", eyebrow, None if alone else el("h1", title), None if alone else _overview(ordered))
-    main = el("main", [_policy(e, number, alone=alone) for number, e in enumerate(ordered, 1)], _words())
+    header = el("header", eyebrow, None if alone else el("h1", title), None if alone else _overview(ordered, refused))
+    policies = [_policy(e, number, alone=alone) for number, e in enumerate(ordered, 1)]
+    main = el("main", [_refused(error, number) for number, error in enumerate(refused, 1)], policies, _words())
     return document(title, header, main, el("footer", f"Written by export-model {__version__}.{data}"))
 
 
@@ -75,11 +81,15 @@ def _words() -> Markup:
     return Markup("".join(_PARTS.joinpath("words.html").read_text(encoding="utf-8").splitlines()))
 
 
-def _overview(entries: Sequence[Entry]) -> Markup:
+def _overview(entries: Sequence[Entry], refused: Sequence[ExportModelError]) -> Markup:
     """Policies by format and runtime: how much of what is allowed the worst difference takes, as a colour."""
     found = [{(p.format, p.runtime): p for p in e.report.pairs} for e in entries]
     pairs = list(dict.fromkeys(pair for rows in found for pair in rows))
     table = [
+        (el("a", place_of(error), href=f"#refused-{n}"), *(_heat(None) for _ in pairs), "–", _REFUSED)
+        for n, error in enumerate(refused, 1)
+    ]
+    table += [
         (
             el("a", e.name, href=f"#policy-{n}"),
             *(_heat(rows.get(pair)) for pair in pairs),
@@ -137,6 +147,12 @@ def _policy(entry: Entry, number: int, *, alone: bool) -> Markup:
         class_="policy",
         open=failed,
     )
+
+
+def _refused(error: ExportModelError, number: int) -> Markup:
+    """What was refused, and why: a part of its own, which is open."""
+    title = el("div", el("h2", place_of(error), id=f"refused-{number}"), _REFUSED, class_="title")
+    return el("section", title, el("pre", error.message), class_="policy only", aria_labelledby=f"refused-{number}")
 
 
 def _chip(entry: Entry) -> Markup:

@@ -10,7 +10,7 @@ from pathlib import Path
 from msgspec import Struct
 
 from exporter.reports.entry import Entry
-from signatures.errors import UsageError
+from signatures.errors import ExportModelError, UsageError
 
 
 class Documents(Struct, frozen=True):
@@ -21,23 +21,26 @@ class Documents(Struct, frozen=True):
     markdown: Callable[[], str]
 
 
-def parity_documents(entries: Callable[[], Sequence[Entry]]) -> Documents:
-    """Return what makes reports on verifications; ``entries`` is called for each."""
+def parity_documents(entries: Callable[[], Sequence[Entry]], refused: Sequence[ExportModelError] = ()) -> Documents:
+    """Return what makes reports on verifications, and on what was ``refused``; ``entries`` is called for each."""
+    from exporter.reports.refused import each_error
+
+    errors = each_error(refused)
 
     def junit() -> bytes:
         from exporter.reports.junit import junit_xml
 
-        return junit_xml(entries())
+        return junit_xml(entries(), errors)
 
     def html() -> str:
         from exporter.reports.page import page
 
-        return page(entries())
+        return page(entries(), errors)
 
     def markdown() -> str:
         from exporter.reports.markdown import markdown_text
 
-        return markdown_text(entries())
+        return markdown_text(entries(), errors)
 
     return Documents(junit, html, markdown)
 
@@ -50,7 +53,10 @@ class Destinations(Struct, frozen=True):
     html: Path | None = None
 
     def prepare(self) -> None:
-        """Make the folders, before anything that takes long. Raises UsageError where a file cannot be written."""
+        """Make the folders, and empty the files of an earlier run, which must not be taken for this one's.
+
+        Before anything that takes long. Raises UsageError where a file cannot be written.
+        """
         files = (self.junit, None if self.markdown == Path("-") else self.markdown, self.html)
         paths = [p for p in files if p is not None]
         for path in paths:
@@ -60,6 +66,8 @@ class Destinations(Struct, frozen=True):
                 raise UsageError("is named for two reports", where=str(path), fix="give each a file of its own")
             with _reporting(path):
                 path.parent.mkdir(parents=True, exist_ok=True)
+                if path.is_file() and not _is_summary(path):
+                    path.write_bytes(b"")
 
     def write(self, documents: Documents, echo: Callable[[str], None]) -> None:
         """Write all of them, each whole; all are made before the first is written. Raises UsageError."""
@@ -79,10 +87,14 @@ class Destinations(Struct, frozen=True):
                 path.write_bytes(data)
 
 
+def _is_summary(path: Path) -> bool:
+    summary = os.environ.get("GITHUB_STEP_SUMMARY")
+    return bool(summary) and path.absolute() == Path(str(summary)).absolute()
+
+
 def _append_to_summary(path: Path, data: bytes) -> bytes:
     """GitHub's summary of a job step is appended to, as its documentation asks; any other file is replaced."""
-    summary = os.environ.get("GITHUB_STEP_SUMMARY")
-    if not summary or path.absolute() != Path(summary).absolute() or not path.exists():
+    if not _is_summary(path) or not path.exists():
         return data
     with _reporting(path):
         before = path.read_bytes()

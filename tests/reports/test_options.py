@@ -51,6 +51,57 @@ def test_all_reports_are_written_whatever_the_verdict(exporting: Exporting, tmp_
     assert ("Passed" if good else "What disagrees") in (folder / "h.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.parametrize("command", ["export", "fleet", "verify"])
+@pytest.mark.parametrize("sound", [0, 1])
+@pytest.mark.parametrize("broken", [1, 2])
+def test_what_is_refused_is_in_every_report(
+    exporting: Exporting, tmp_path: Path, command: str, sound: int, broken: int
+) -> None:
+    exporting(command=(fixture("continuous"), fixture("discrete"), fixture("visual"), "-o", tmp_path / "in"))
+    bundles = [tmp_path / "in" / name for name in ("continuous", "discrete", "visual")][: sound + broken]
+    for bundle in bundles[sound:]:
+        main = bundle / f"{bundle.name}.bytes"
+        main.write_bytes(main.read_bytes()[:-300])
+    sources: list[object] = [b if command == "verify" else b / f"{b.name}.bytes" for b in bundles]
+    given = ("verify", *sources) if command == "verify" else (*sources, "-o", tmp_path / "out")
+    reports = [tmp_path / name for name in ("j.xml", "m.md", "h.html")]
+    for report in reports:
+        report.write_text("of yesterday: all is well")
+    flags = ("--junit", reports[0], "--markdown", reports[1], "--html", reports[2])
+    ran = exporting(*flags, *(("--jobs", 1) if command == "fleet" else ()), command=given)
+    assert ran.status == 2
+    root = ET.parse(reports[0]).getroot()
+    assert root.get("errors") == str(broken)
+    errors = [case for case in root.iter("testcase") if case.find("error") is not None]
+    words = [str(case[0].text) for case in errors]
+    marked = [el for el in reports[2].read_text(encoding="utf-8").split("<section")[1:] if "chip failed" in el]
+    for number, bundle in enumerate(bundles[sound:]):
+        assert bundle.name in str(errors[number].get("classname")) and bundle.name in words[number]
+        assert bundle.name in marked[number] and "Refused" in marked[number]
+        assert f"### ❌ `{errors[number].get('classname')}`" in reports[1].read_text(encoding="utf-8")
+    assert any(str(suite.get("name")).startswith("continuous.") for suite in root) == (sound == 1)
+
+
+def test_no_report_of_an_earlier_run_is_left(
+    exporting: Exporting, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    report = tmp_path / "j.xml"
+    report.write_text("of yesterday: all is well")
+    is_refused(exporting("--junit", report, "--to", "onyx"), "onyx")
+    assert ET.parse(report).getroot().find("testsuite/testcase/error") is not None
+
+    def stop(*given: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("exporter.cli.export._export_few", stop)
+    report.write_text("of yesterday: all is well")
+    summary = tmp_path / "summary.md"
+    summary.write_text("of the step before\n")
+    monkeypatch.setenv("GITHUB_STEP_SUMMARY", str(summary))
+    assert exporting("--junit", report, "--markdown", summary).status == 130
+    assert report.read_text() == "" and summary.read_text() == "of the step before\n"
+
+
 def test_the_reports_of_an_export_say_how_it_was_judged(exporting: Exporting, tmp_path: Path) -> None:
     assert exporting("--html", tmp_path / "h.html", "--atol", "0.5", "--max-size", "1GB").status == 0
     again = (tmp_path / "h.html").read_text(encoding="utf-8").partition("To compare again")[2].partition("</p>")[0]
