@@ -7,11 +7,11 @@ reader has run. Nothing here knows a language.
 from __future__ import annotations
 
 from collections import Counter as Count
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from typing import Any, NamedTuple
 
 import numpy as np
-from msgspec import Struct, field
+from msgspec import Struct
 from msgspec.structs import replace
 
 from converters.graph.nodes import Graph, Node, TensorShape, ref
@@ -46,7 +46,7 @@ class Place(Struct, eq=False):
     offset: int = 0
 
 
-class Stage(Struct, eq=False):
+class Stage(Struct, frozen=True, eq=False):
     """One nest of loops: every element of ``result``, and the layer of the source that it stands for."""
 
     result: Tensor
@@ -56,13 +56,16 @@ class Stage(Struct, eq=False):
     about: str
 
 
-class Program(Struct, eq=False):
-    """Stages in their order, the constants that they read, the inputs and outputs by name, the size of each arena."""
+class Program(Struct, frozen=True, eq=False):
+    """Stages in their order, the constants that they read, the inputs and outputs by name, the size of each arena.
 
-    stages: list[Stage]
+    Frozen: one program is printed in several languages, each after the other.
+    """
+
+    stages: tuple[Stage, ...]
     inputs: dict[str, Tensor]
     outputs: dict[str, Tensor]
-    arenas: dict[str, int] = field(default_factory=dict)
+    arenas: Mapping[str, int]
 
     @property
     def constants(self) -> list[Place]:
@@ -232,11 +235,9 @@ def program_of(graph: Graph, feeds: Mapping[str, str], fetches: Mapping[str, str
             for i, tensor in enumerate(made if isinstance(made, tuple) else (made,)):
                 builder.tensors[ref(node.name, i)] = tensor
     outputs = {name: builder.value(reference) for name, reference in fetches.items()}
-    program = Program(builder.stages, inputs, outputs)
-    _leave_out(program)
-    _join(program)
-    _plan(program)
-    return program
+    given = {t.place for t in outputs.values()}
+    stages = _join(_leave_out(builder.stages, given), given)
+    return Program(tuple(stages), inputs, outputs, _plan(stages, given))
 
 
 def _for_one(node: Node) -> Node:
@@ -245,15 +246,14 @@ def _for_one(node: Node) -> Node:
     return replace(node, attrs={**node.attrs, "shape": TensorShape((1, *node.dims[1:]))})
 
 
-def _leave_out(program: Program) -> None:
-    """Stages that nothing reads go."""
-    needed = {t.place for t in program.outputs.values()}
-    kept = []
-    for stage in reversed(program.stages):
+def _leave_out(stages: Sequence[Stage], given: Set[Place]) -> list[Stage]:
+    """Return the stages that others, or what is ``given`` as an output, need."""
+    needed, kept = set(given), list[Stage]()
+    for stage in reversed(stages):
         if stage.result.place in needed:
             needed |= {e.tensor.place for e in elements(stage.body)}
             kept.append(stage)
-    program.stages = kept[::-1]
+    return kept[::-1]
 
 
 #: Terms of one loop's expression: a chain of ops without end would be one expression, which a compiler, too, reads
@@ -261,28 +261,28 @@ def _leave_out(program: Program) -> None:
 MAX_TERMS = 512
 
 
-def _join(program: Program) -> None:
+def _join(stages: list[Stage], given: Set[Place]) -> list[Stage]:
     """A stage that one other alone reads, element by element and in the same loops, becomes a part of that.
 
     Not two that reduce: a printer computes eight elements of one reduction side by side.
     """
-    while _join_once(program):
-        pass
+    while len(joined := _join_once(stages, given)) < len(stages):
+        stages = joined
+    return stages
 
 
-def _join_once(program: Program) -> bool:
-    """Join each stage with those that it alone reads; return whether there were any."""
-    made: dict[Any, Stage] = {s.result.place: s for s in program.stages}
-    readers = Count(p for s in program.stages for p in {e.tensor.place for e in elements(s.body)})
-    kept_places = {t.place for t in program.outputs.values()}
-    alone = {p: s for p, s in made.items() if readers[p] == 1 and p not in kept_places}
+def _join_once(stages: Sequence[Stage], given: Set[Place]) -> list[Stage]:
+    """Join each stage with those that it alone reads."""
+    made: dict[Any, Stage] = {s.result.place: s for s in stages}
+    readers = Count(p for s in stages for p in {e.tensor.place for e in elements(s.body)})
+    alone = {p: s for p, s in made.items() if readers[p] == 1 and p not in given}
     traits = {p: _traits_of(s.body) for p, s in made.items()}
     gone: set[Any] = set()
-    for stage in program.stages:
+    for stage in stages:
         swap: dict[int, Expression] = {}
         own, abouts = traits[stage.result.place], list[str]()
         for place, found in _reads(stage, alone, own).items():
-            before, other = alone[place], traits[place]
+            before, other = made[place], traits[place]
             if other.draws or split_loop(before, before.body) or (own.reduces and other.reduces):
                 continue
             if own.terms + other.terms > MAX_TERMS:
@@ -293,11 +293,10 @@ def _join_once(program: Program) -> bool:
             gone.add(place)
             abouts.append(before.about)
         if swap:
-            stage.about = ", ".join([*abouts, stage.about])
-            stage.body = inline_scalars(stage.body, swap)
+            about, body = ", ".join([*abouts, stage.about]), inline_scalars(stage.body, swap)
+            made[stage.result.place] = replace(stage, about=about, body=body)
             traits[stage.result.place] = own
-    program.stages = [s for s in program.stages if s.result.place not in gone]
-    return bool(gone)
+    return [stage for place, stage in made.items() if place not in gone]
 
 
 class _Traits(NamedTuple):
@@ -338,14 +337,14 @@ def _same_place(e: Element, before: Stage, stage: Stage) -> bool:
     )
 
 
-def _plan(program: Program) -> None:
-    """Give each computed tensor a part of its arena that is free as long as it is read."""
+def _plan(stages: Sequence[Stage], given: Set[Place]) -> dict[str, int]:
+    """Give each computed tensor a part of its arena that is free as long as it is read; return the arenas' sizes."""
     last: dict[Any, int] = {}
-    for i, stage in enumerate(program.stages):
+    for i, stage in enumerate(stages):
         last |= {e.tensor.place: i for e in elements(stage.body)}
-    last |= {t.place: len(program.stages) for t in program.outputs.values()}
-    taken: dict[str, list[tuple[int, int, int]]] = {}
-    for i, stage in enumerate(program.stages):
+    last |= dict.fromkeys(given, len(stages))
+    taken, arenas = dict[str, list[tuple[int, int, int]]](), dict[str, int]()
+    for i, stage in enumerate(stages):
         place = stage.result.place
         arena = arena_of(place.dtype)
         live = sorted((a, b) for a, b, until in taken.get(arena, []) if until >= i)
@@ -356,7 +355,8 @@ def _plan(program: Program) -> None:
             start = max(start, b)
         place.offset = start
         taken.setdefault(arena, []).append((start, start + place.size, last[place]))
-        program.arenas[arena] = max(program.arenas.get(arena, 0), start + place.size)
+        arenas[arena] = max(arenas.get(arena, 0), start + place.size)
+    return arenas
 
 
 __all__ = ["Index", "Place", "Program", "Stage", "arena_of", "children", "elements", "every", "program_of"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 import numpy as np
+from msgspec.structs import replace
 
 from converters.files.chunks import Pieces
 from converters.formats.c.extras import (
@@ -69,8 +70,8 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
 
 
 def _text(name: str, plan: Plan) -> str:
+    plan = replace(plan, program=widen_where_used(plan.program, plan.weights))
     header, program, p = plan.header, plan.program, plan.header.prefix
-    widen_where_used(program, plan.weights)
     words = C(p, plan.code.math == "own")
     printer = Printer(words, f"{p}_w_")
     by_name = {f.spec.name: f"input->{f.name}" for f in header.inputs}

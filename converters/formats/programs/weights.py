@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 from msgspec import Struct, field
+from msgspec.structs import replace
 
 from converters.compiler.passes.weights import Storage, compact
 from converters.graph.ops.loops.base import Element, Expression, Tensor, apply, number
@@ -111,8 +112,9 @@ def _channel(kept: Kept, x: Element) -> Expression:
     return apply("mod", flat, number(kept.step.size))
 
 
-def widen_where_used(program: Program, weights: Weights) -> None:
-    """Let a program read its constants as they are kept: a cast, and a step's length, at each element."""
+def widen_where_used(program: Program, weights: Weights) -> Program:
+    """Return a program that reads its constants as they are kept: a cast, and a step's length, at each element."""
+    stages = []
     for stage in program.stages:
         swap: dict[int, Expression] = {}
         for one in elements(stage.body):
@@ -125,5 +127,5 @@ def widen_where_used(program: Program, weights: Weights) -> None:
                 length = Element(Tensor(kept.step, FLOAT32, (kept.step.size,)), (_channel(kept, one),))
                 wide = apply("mul", wide, length)
             swap[id(one)] = wide
-        if swap:
-            stage.body = inline_scalars(stage.body, swap)
+        stages.append(replace(stage, body=inline_scalars(stage.body, swap)) if swap else stage)
+    return replace(program, stages=tuple(stages))
