@@ -13,39 +13,29 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from converters.formats.programs.members import header_of
 from converters.runtimes.c import compiler
 from exporter.export.pipeline import ExportOptions, export
 from signatures.errors import ExportModelError
 from tests import known
-from tests.programs.mains import c_main
+from tests.programs.mains import c_main, called
 
 LINES = Path(__file__).resolve().parents[2] / "build" / "sanitized.jsonl"
 FLAGS = ("-std=c99", "-O1", "-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all",
          "-Wall", "-Wextra", "-Wconversion", "-Werror")  # fmt: skip
-_SELFTEST = "\nint main(void)\n{{\n    if ({p}_selftest(&memory) != 0) return 3;\n"
 
 
 def judge(file: Path, cc: str, scratch: Path) -> Iterator[tuple[str, str]]:
     """Of each policy of a file its name, and what is wrong with its C. Raises ExportModelError."""
     for result in export([file], ExportOptions(scratch, ("c",), verify="none")):
-        header = header_of(result.policy.name, result.policy.signature)
-        main = c_main(result.policy.name, header, len(result.policy.signature.branches) if _chooses(result) else 0)
-        main = main.replace("\nint main(void)\n{\n", _SELFTEST.format(p=header.prefix))
-        (result.folder / "main.c").write_text(f"#define {header.prefix.upper()}_SELFTEST\n{main}", "ascii")
+        (result.folder / "main.c").write_text(c_main(called(result.policy)), "ascii")
         built = subprocess.run([cc, *FLAGS, "-o", "main", "main.c", "-lm"], cwd=result.folder, capture_output=True)
         if built.returncode:
             yield result.policy.name, built.stderr.decode(errors="replace")[:400]
             continue
         ran = subprocess.run([str(result.folder / "main")], cwd=result.folder, capture_output=True)
-        yield (
-            result.policy.name,
-            f"{ran.returncode} {ran.stderr.decode(errors='replace')[:400]}" * (ran.returncode != 0),
-        )
-
-
-def _chooses(result: Any) -> bool:
-    return "_choose(" in (result.folder / f"{result.policy.name}.h").read_text()
+        missed = "golden numbers are missed" * (b"missed" in ran.stdout)
+        said = f"{ran.returncode} {ran.stderr.decode(errors='replace')[:400]}" * (ran.returncode != 0)
+        yield result.policy.name, missed or said
 
 
 def line(file: Path, cc: str) -> dict[str, Any]:

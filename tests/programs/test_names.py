@@ -23,7 +23,7 @@ from exporter.export.sources import read_source
 from fixtures import FIXTURES, path
 from signatures.code import CodeOptions
 from tests.graph.harness import Runtimes, policy_of
-from tests.programs.mains import MAINS
+from tests.programs.mains import MAINS, called
 from tests.programs.test_options import build, said
 from tests.programs.test_programs import PROGRAMS
 
@@ -109,17 +109,16 @@ def test_inputs_called_as_a_program_calls_something(
 def test_policies_called_as_a_program_calls_something(form: Format, name: str, tmp_path: Path) -> None:
     """Draws, the state and the guard included."""
     (policy,) = read_source(path("recurrent")).policies()
-    plain = header_of(policy.name, policy.signature)
     expected = tmp_path / "expected"
-    for folder, called in ((expected, policy.name), (tmp_path / "found", name)):
+    for folder, stem in ((expected, policy.name), (tmp_path / "found", name)):
         folder.mkdir()
-        named = replace(policy, name=called)
+        named = replace(policy, name=stem)
         for each, pieces in form.artifact(named, WriteOptions("{}")).files.items():
             (folder / each).write_bytes(pieces.to_bytes())
     main = MAINS[form.key][0]
-    wanted = said(build(form, main(policy.name, plain), expected), expected)
+    wanted = said(build(form, main(called(policy)), expected), expected)
     here = tmp_path / "found"
-    assert said(build(form, main(name, header_of(name, policy.signature)), here), here) == wanted
+    assert said(build(form, main(called(replace(policy, name=name))), here), here) == wanted
 
 
 def test_no_macro_of_the_headers_is_a_member() -> None:

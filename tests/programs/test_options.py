@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from converters.compiler.passes.weights import Storage, round_weights
+from converters.compiler.passes.weights import Storage
 from converters.formats.format import Format, WriteOptions
 from converters.formats.programs.artifact import can_confine, vetted
-from converters.formats.programs.members import answers, header_of
+from converters.formats.programs.members import answers
 from converters.formats.programs.weights import weights_name
 from converters.formats.registry import WRITTEN
 from converters.policy.policy import Policy
@@ -25,7 +25,7 @@ from exporter.api import verify_bundle
 from exporter.export.pipeline import Exporter, ExportOptions, export
 from exporter.export.sources import read_source
 from exporter.reports.summary import failure_lines
-from fixtures import FIXTURES, path
+from fixtures import path
 from signatures.code import CodeOptions, code_options
 from signatures.errors import DamagedFileError, UsageError
 from tests.programs.mains import MAINS
@@ -89,41 +89,6 @@ def test_policies_agree(name: str, weights: Storage, form: Format, tmp_path: Pat
     again = verify_bundle(result.folder, runtimes=runtime)
     assert again.passed is True, "\n".join(failure_lines(again))
     assert {c.output for c in again.comparisons if c.runtime == runtime} >= everything
-
-
-@each_program
-@pytest.mark.parametrize("weights", ["float16", "int8"])
-def test_fewer_bytes_compute_the_same_bits(weights: Storage, form: Format, tmp_path: Path) -> None:
-    """As the same numbers in float32, which take more than twice the room."""
-    policy = policy_named("visual")
-    policy = replace(policy, graph=round_weights(policy.graph, weights))
-    main, _ = MAINS[form.key]
-    printed, sizes = [], []
-    for storage in ("float32", weights):
-        folder = tmp_path / storage
-        folder.mkdir()
-        artifact = form.artifact(policy, WriteOptions("{}", weights=storage, code=CodeOptions(math="own")))
-        artifact.write(folder)
-        text = main(policy.name, header_of(policy.name, policy.signature))
-        printed.append(said(build(form, text, folder), folder))
-        sizes.append(artifact.size)
-    assert printed[0] == printed[1]
-    assert len(set(printed[0])) > 1
-    assert sizes[1] < sizes[0] * (0.7 if weights == "float16" else 0.5)
-
-
-@pytest.mark.parametrize("name", FIXTURES)
-def test_all_languages_load_the_same_file(name: str) -> None:
-    """And every file has the same bytes each time."""
-
-    def written() -> list[dict[str, bytes]]:
-        how = WriteOptions("{}", weights="int8", code=EVERYTHING)
-        policy = policy_named(name)
-        return [{n: d.to_bytes() for n, d in f.artifact(policy, how).files.items()} for f in PROGRAMS]
-
-    first = written()
-    assert first == written()
-    assert len({files[next(n for n in files if n.endswith(".bin"))] for files in first}) == 1
 
 
 # ------------------------------------------------------------------ other weights

@@ -10,8 +10,6 @@ from pathlib import Path
 import pytest
 
 from converters.formats.format import WriteOptions
-from converters.formats.programs.members import header_of
-from converters.formats.programs.plan import plan_of
 from converters.formats.registry import WRITTEN
 from converters.graph.ops.loops.own_math import OWN
 from converters.policy.policy import Policy
@@ -25,7 +23,7 @@ from signatures.code import CodeOptions, code_options
 from signatures.errors import UsageError
 from tests.bench.own_math import measure
 from tests.programs.machines import MACHINES
-from tests.programs.mains import MAINS
+from tests.programs.mains import MAINS, called
 
 pytestmark = pytest.mark.xdist_group("programs")
 
@@ -48,11 +46,9 @@ def test_no_function_is_farther_off_than_it_says(function: str, tmp_path: Path) 
 def _compiled(policy: Policy, folder: Path) -> Iterator[tuple[str, list[str]]]:
     """Who runs a policy's source code, and the commands that do."""
     for form in (f for f in WRITTEN.values() if f.program):
-        plan = plan_of(policy, WriteOptions("{}"))
         form.artifact(policy, WriteOptions("{}", code=OWN_MATH)).write(folder)
         main, file = MAINS[form.key]
-        header = header_of(policy.name, policy.signature)
-        (folder / file).write_text(main(policy.name, header, len(plan.sizes) if plan.chosen else 0), "ascii")
+        (folder / file).write_text(main(called(policy)), "ascii")
     for each in filter(None, map(shutil.which, ("gcc", "clang"))):
         for flags in FLAGS:
             command = [each, "-Wall", "-Wextra", "-Wconversion", "-Werror", *flags.split(), "main.c", "-o", "main"]
