@@ -178,9 +178,13 @@ def _content(folder: Path, scene: str) -> tuple[dict[str, bytes], dict[str, Any]
     }
 
 
-def _original(policy: Bundle) -> str | None:
-    """What the bundle agreed with when it was exported, in words; None where its report does not say so."""
+def _original(policy: Bundle) -> dict[str, str] | None:
+    """Return the runtime of the original that the bundle agreed with, and within what share of the tolerance.
+
+    None where the bundle's report does not say that the original ran.
+    """
     from converters.runtimes.pool import INDEPENDENT
+    from exporter.verify.findings import share_text
     from exporter.verify.verdict import runtime_title
 
     try:
@@ -189,7 +193,12 @@ def _original(policy: Bundle) -> str | None:
     except (OSError, ValueError):
         return None
     original = report.get("original") if isinstance(report, dict) and report.get("passed") is True else None
-    return runtime_title(original) if original in INDEPENDENT else None
+    if original not in INDEPENDENT:
+        return None
+    comparisons = report.get("comparisons")
+    shares = [c.get("share") for c in comparisons if isinstance(c, dict)] if isinstance(comparisons, list) else []
+    worst = max((s for s in shares if isinstance(s, float | int)), default=0.0)
+    return {"runtime": runtime_title(original), "share": share_text(worst)}
 
 
 def describe_page(page: bytes, name: str, family: str, acts: bool) -> bytes:

@@ -138,5 +138,5 @@ def test_a_served_gallery_leads_to_pages_that_play(folder: Path) -> None:
     assert (seen.results[1], seen.results[3]) == (0, 0)
     assert seen.results[4] == [640, 640, 640]
     assert seen.results[-2] == "/3DBall/"
-    assert seen.results[-1].startswith("✓ Same answers as export-model, worst ")
+    assert seen.results[-1].startswith("✓ Computes what was exported (worst ")
     assert [said for said in seen.console if said != "warning: No available adapters."] == []

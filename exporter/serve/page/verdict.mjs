@@ -16,8 +16,11 @@ export class Verdict {
   constructor(host, { backends, absent, original }) {
     this.host = host;
     this.backends = backends;
-    /** What the policy agreed with when it was exported, in words; null where it was compared with nothing. */
-    this.original = original;
+    /** What the original said of the exported policy, in a sentence: this page runs the export alone. */
+    this.original =
+      original === null
+        ? "The original was not run."
+        : `The export agreed with ${original.runtime} (at most ${original.share} of the tolerance).`;
     const head = (...names) => h("thead", {}, h("tr", {}, names.map((name) => h("th", { scope: "col" }, name))));
     const table = (caption, columns, body, extra = "") => {
       return h(
@@ -81,8 +84,8 @@ export class Verdict {
     const drawn = left.length ? ` Drawn by chance inside the model, and so not compared: ${left.join(", ")}.` : "";
     $("check-how").textContent =
       `${cases.length} sets of inputs, ${rows} decisions, drawn from what the policy knows of its inputs. Every number must ` +
-      `agree with export-model's own reference by ${RULE}, every choice exactly. ` +
-      `${this.original === null ? "" : `That reference agreed with ${this.original} when the policy was exported. `}Times are of one decision for one agent: ` +
+      `agree with export-model's own kernels, which ran the exported policy, by ${RULE}, every choice exactly. ` +
+      `${this.original} Times are of one decision for one agent: ` +
       `inputs given, model run, answer read back.${drawn}`;
   }
 
@@ -133,6 +136,6 @@ export class Verdict {
     }
     const worst = Math.max(...ran.flatMap(({ outputs }) => outputs.map((output) => output.worst)));
     const engines = ran.length === 1 ? "" : ` on ${ran.length} engines`;
-    return this.#say(`✓ Same answers as ${this.original ?? "export-model"}, worst ${text(worst)}, checked in your browser${engines}.${note}`, "ok");
+    return this.#say(`✓ Computes what was exported (worst ${text(worst)}), checked in your browser${engines}. ${this.original}${note}`, "ok");
   }
 }
