@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import functools
+import http.server
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
 import sys
+import threading
 import tomllib
 import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -17,6 +23,7 @@ import pytest
 from exporter.demo.files import write_files
 from tests.commands import PLACES, ROOT
 from tests.docs.blocks import Block
+from tests.serve.browsing import needed, visit
 
 #: First on PYTHONPATH, a module there makes ``auto`` stand for onnxruntime.
 NARROW = ROOT / "tests/docs/narrow"
@@ -28,6 +35,25 @@ def furnish(folder: Path) -> None:
     write_files(folder)
     if MODULES.is_dir():
         (folder / "node_modules").symlink_to(MODULES)
+
+
+@contextmanager
+def _serving(folder: Path) -> Iterator[str]:
+    """What ``python -m http.server`` does there; gives the address."""
+    handler = functools.partial(_Quiet, directory=str(folder))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            yield f"http://127.0.0.1:{server.server_port}"
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+class _Quiet(http.server.SimpleHTTPRequestHandler):
+    def log_message(self, format: str, *args: object) -> None:
+        pass
 
 
 class Workshop:
@@ -52,6 +78,25 @@ class Workshop:
             self._interrupted(command, block)
         else:
             self._finished(command, block)
+            for target, name in re.findall(r"--for (\S+) > (\S+\.(?:html|mjs))", block.text):
+                self._opened(self.folder / name, block, served="cdn" not in target)
+
+    def _opened(self, file: Path, block: Block, *, served: bool) -> None:
+        """Open a page or run a program that a block wrote, with npm's packages beside it; no CDN can be reached."""
+        node = shutil.which("node")
+        if node is None or not MODULES.is_dir() or (file.suffix == ".html" and needed() is not None):
+            return
+        if not (file.parent / "node_modules").exists():
+            (file.parent / "node_modules").symlink_to(MODULES)
+        if file.suffix == ".mjs":
+            self._finished([node, file.name], block, file.parent)
+            return
+        answer = "document.getElementById('answer').textContent"
+        with _serving(file.parent) as address:
+            seen = visit(f"{address}/{file.name}", [["wait", f"{answer} !== ''"], ["eval", answer]])
+        shown = str(seen.results[-1])
+        wanted = "[" if served else "Error: a module was not loaded"
+        assert shown.startswith(wanted), f"{block.where}: {file.name} shows {shown}"
 
     def python(self, block: Block) -> None:
         text = f"{self._last}\n\n{block.text}" if block.verb == "continues" else block.text
@@ -97,10 +142,10 @@ class Workshop:
             "CUDA_VISIBLE_DEVICES": "-1",
         }
 
-    def _finished(self, command: list[str], block: Block) -> None:
+    def _finished(self, command: list[str], block: Block, folder: Path | None = None) -> None:
         done = subprocess.run(
             command,
-            cwd=self.folder,
+            cwd=folder or self.folder,
             env=self._environment(),
             stdin=subprocess.DEVNULL,
             capture_output=True,
