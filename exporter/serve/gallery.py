@@ -7,13 +7,14 @@ takes. The index is HTML alone: no script runs on it.
 from __future__ import annotations
 
 import html
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from msgspec import Struct
 
 from converters.formats.bundle.bundle import Bundle, dumps
 from exporter import __version__
+from exporter.export.names import Names
 from exporter.serve.scenes import other_side, scene_of
 from exporter.serve.server import INDEX
 from exporter.serve.site import MADE_BY, PAGE, SITE, assemble, assemble_one_file, preview
@@ -81,9 +82,12 @@ class Gallery(Struct, frozen=True):
 def assemble_gallery(folders: Sequence[Path], *, whole: bool) -> Gallery:
     """The gallery of bundles; ``whole``: each page a site in a folder, else one file.
 
-    A brain whose opponent is shown plays on that page. Raises the first BundleError where none can be shown.
+    A brain whose opponent is shown plays on that page. Bundles of one name get addresses of their own. Raises the first
+    BundleError where none can be shown.
     """
-    make: Callable[[Path], Mapping[str, bytes]] = assemble if whole else _as_file
+    names = Names()
+    for own in ("index", "pictures"):
+        names.reserve(Path(own), own)
     files: dict[str, bytes] = {STYLE: _CSS.encode(), "icon.svg": (PAGE / "icon.svg").read_bytes()}
     cards: list[str] = []
     shown: list[str] = []
@@ -91,18 +95,20 @@ def assemble_gallery(folders: Sequence[Path], *, whole: bool) -> Gallery:
     for folder in folders:
         try:
             name = Bundle.open(folder).name
-            if any(other in shown for other in other_side(name)):
+            if folder.name == name and any(other in shown for other in other_side(name)):
                 continue
-            page = make(folder)
+            page = assemble(folder) if whole else {"": _as_file(folder)}
         except ExportModelError as error:
             left_out.append(error)
             continue
-        files.update({f"{name}/{path}" if whole else path: data for path, data in page.items()})
-        shown.append(name)
+        ((own, _),) = names.claim(folder, [name])
+        address = f"{own}/" if whole else f"{own}.html"
+        files.update({f"{address}{path}": data for path, data in page.items()})
+        shown.append(own)
         picture = _picture(folder)
         if picture is not None:
             files[f"pictures/{picture.name}"] = picture.read_bytes()
-        cards.append(_card(folder, f"{name}/" if whole else f"{name}.html", picture))
+        cards.append(_card(folder, own, address, picture))
     if not shown:
         raise left_out[0] if left_out else BundleError("no bundle was given", fix="export-model SOURCE -o exported")
     first = next((path for path in sorted(files) if path.startswith("pictures/")), None)
@@ -113,12 +119,9 @@ def assemble_gallery(folders: Sequence[Path], *, whole: bool) -> Gallery:
     return Gallery(files, tuple(shown), tuple(left_out))
 
 
-def _as_file(folder: Path) -> Mapping[str, bytes]:
-    found = Bundle.open(folder)
+def _as_file(folder: Path) -> bytes:
     picture = _picture(folder)
-    return {
-        f"{found.name}.html": assemble_one_file(folder, picture=None if picture is None else f"pictures/{picture.name}")
-    }
+    return assemble_one_file(folder, picture=None if picture is None else f"pictures/{picture.name}")
 
 
 def _picture(folder: Path) -> Path | None:
@@ -128,9 +131,8 @@ def _picture(folder: Path) -> Path | None:
     return preview(None if scene is None else scene.id)
 
 
-def _card(folder: Path, address: str, picture: Path | None) -> str:
-    found = Bundle.open(folder)
-    signature = found.signature
+def _card(folder: Path, name: str, address: str, picture: Path | None) -> str:
+    signature = Bundle.open(folder).signature
     facts = html.escape(f"{signature.family} · {signature.action_space} actions")
     image = "" if picture is None else f'<img src="pictures/{picture.name}" alt="" width="640" height="360">'
-    return f'<li>{image}<h2><a href="{address}">{found.name}</a></h2><p>{facts}</p></li>'
+    return f'<li>{image}<h2><a href="{address}">{name}</a></h2><p>{facts}</p></li>'

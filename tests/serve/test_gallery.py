@@ -110,6 +110,18 @@ def test_what_cannot_be_shown_is_left_out_by_name(folder: Path, tmp_path: Path) 
         assemble_gallery([folder / "GridWorld"], whole=False)
 
 
+@pytest.mark.parametrize("whole", [True, False])
+def test_bundles_of_one_name_have_pages_of_their_own(bundle: Bundle, tmp_path: Path, whole: bool) -> None:
+    folders = [tmp_path / name for name in ("continuous", "newer", "newest")]
+    for folder in folders:
+        shutil.copytree(bundle("continuous"), folder)
+    gallery = assemble_gallery(folders, whole=whole)
+    addresses = re.findall(r'<a href="([^"]+)">([^<]+)</a>', gallery.files["index.html"].decode())
+    assert len(set(addresses)) == len(set(map(str.casefold, gallery.shown))) == 3
+    assert all((f"{address}index.html" if whole else address) in gallery.files for address, _ in addresses)
+    assert [name for _, name in addresses] == list(gallery.shown)
+
+
 def test_options_of_a_single_page_are_refused(folder: Path, tmp_path: Path) -> None:
     is_refused(export_model("serve", folder, "-o", tmp_path / "all.html"), "do not fit", "-o gallery")
     is_refused(export_model("serve", folder, "--scene", "tennis", "-o", tmp_path / "x"), "a single bundle")
