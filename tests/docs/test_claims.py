@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import re
+import tomllib
 from pathlib import Path
 
 import click
@@ -11,6 +13,7 @@ import pytest
 from converters.consumers.profiles import PROFILES, profile
 from converters.formats.registry import WRITTEN
 from exporter.cli.app import app
+from exporter.demo import BALL
 from exporter.snippets.registry import TARGETS
 from exporter.verify import rounding, statistics
 from exporter.verify.checks import decisions, draws
@@ -18,6 +21,7 @@ from exporter.verify.difference import SHARE, SIZE
 from exporter.verify.options import VerifyOptions
 from exporter.verify.tolerances import ATOL, RTOL, Tolerance, tolerance_for
 from exporter.verify.work import SECONDS
+from signatures.errors import ParityError, RuntimeUnavailableError, SourceError, UsageError
 from signatures.sampling import LARGE_BATCH, MOST_IDS
 from tests.commands import ROOT, export_model
 from tests.docs.blocks import name_of, pages
@@ -105,6 +109,56 @@ def test_the_exception_is_as_the_page_says() -> None:
     assert (held.atol, held.rtol) == (5e-3, 5e-3)
     assert held.reason
     assert tolerance_for(Sac(), "action", Tolerance()) == Tolerance()  # type: ignore[arg-type]
+
+
+#: What README and the front page say in figures, and where it is held to what is.
+HELD = (
+    r"0 of [\d,]+ comparisons failed · \d+ trained [\w ]+ and \d+ that [\w ]+ · \d+ runtimes",  # test_figures.py
+    r"\d+ trained [\w ]+, and \d+ that the trainers of ML-Agents 0\.3 to 0\.22 wrote",  # test_figures.py
+    r"[\d,]+ comparisons in \d+ runtimes",  # test_figures.py
+    r"\|a − b\| ≤ 1e-5 \+ 1e-5·\|b\|",  # test_the_rule_is_the_one_that_is_applied
+    r"1e-5 \+ 1e-5·\|b\|",
+    r"exit status 1",  # tests/reports/test_options.py
+    r"Exit status: 0 done, 1 something disagrees, 2 bad input or command line, 3 a runtime",
+    r"ML-Agents 0\.1 to 1\.1",  # test_the_words_of_readme…
+    r"Python 3\.11 to 3\.13 with `venv`, and Node 20: what the tests run on; pip installs it on 3\.14",
+    r"Apache-2\.0",
+    r"3DBall|Stable-Baselines3|float32",
+)
+
+
+@pytest.mark.parametrize("name", ["README.md", "docs/index.md"])
+def test_every_figure_of_the_front_pages_is_held(name: str) -> None:
+    text = re.sub(r"<!--.*?-->|```.*?```|\]\([^)]*\)", "", (ROOT / name).read_text(encoding="utf-8"), flags=re.DOTALL)
+    text = " ".join(text.split())
+    for claim in HELD:
+        text = re.sub(claim, "", text)
+    assert not re.findall(r"\S*\d\S*", text)
+
+
+def test_the_words_of_readme_are_those_of_the_project() -> None:
+    readme = prose(ROOT / "README.md")
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    workflow = (ROOT / ".github/workflows/test.yml").read_text(encoding="utf-8")
+    tested = json.loads(re.findall(r"matrix: \{ python: (\[.*?\])", workflow)[0])
+    assert f"Python {tested[0]} to {tested[-1]} with" in readme and project["requires-python"] == ">=3.11,<3.15"
+    assert f"{project['license']}. Tested on Linux" in readme
+    table = (ROOT / "docs/generations.md").read_text(encoding="utf-8").partition("## What")[0]
+    rows = re.findall(r"^\| (\d[^|]*) \|", table, re.M)
+    oldest, newest = re.findall(r"[\d.]*\d", rows[0])[0], re.findall(r"[\d.]*\d", rows[-1])[-1]
+    assert f"ML-Agents {oldest} to {newest}," in readme
+    statuses = {e.__name__: e.exit_status for e in (ParityError, SourceError, UsageError, RuntimeUnavailableError)}
+    assert statuses == {"ParityError": 1, "SourceError": 2, "UsageError": 2, "RuntimeUnavailableError": 3}
+
+
+def test_the_sizes_that_readme_shows_are_those_that_are_written(tmp_path: Path) -> None:
+    """Within a tenth: of the formats, some are written a little smaller or larger from day to day."""
+    (written,) = export_model(BALL, "-o", tmp_path, "--verify", "none", "--json").json["policies"]
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    shown = {kind: float(size) for kind, size in re.findall(r"^ok +(\w+) +\S+ +([\d.]+) kB", readme, re.M)}
+    assert shown.keys() == written["sizes"].keys()
+    for kind, size in written["sizes"].items():
+        assert shown[kind] == pytest.approx(size / 1e3, rel=0.1), kind
 
 
 def test_the_verdict_that_readme_shows_is_one_that_is_said() -> None:
