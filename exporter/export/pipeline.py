@@ -77,7 +77,12 @@ class ExportResult(Struct, frozen=True):
     whole_sizes: Mapping[str, int] = field(default_factory=dict)
 
     def __repr__(self) -> str:
-        verdict = "not verified" if self.report is None else self.report.verdict
+        verdict = "not verified"
+        if self.report is not None and self.report.passed is not None:
+            from exporter.verify.verdict import checked_formats, formats_of
+
+            count = f"{len(checked_formats(self.report))} of {count_text(len(formats_of(self.report)), 'format')}"
+            verdict = f"{self.report.verdict} ({count})"
         return f"<ExportResult {self.policy.name!r} {verdict}: {', '.join(self.sizes)} in {path_text(self.folder)!r}>"
 
     def _repr_html_(self) -> str:

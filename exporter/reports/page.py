@@ -59,7 +59,7 @@ def page(entries: Sequence[Entry], refused: Sequence[ExportModelError] = ()) -> 
     data = " parity.json in the bundle holds the same as data." if bundled else ""
     header = el("header", eyebrow, None if alone else el("h1", title), None if alone else _overview(ordered, refused))
     policies = [_policy(e, number, alone=alone) for number, e in enumerate(ordered, 1)]
-    main = el("main", [_refused(error, number) for number, error in enumerate(refused, 1)], policies, _words())
+    main = el("main", [_refusal(error, number) for number, error in enumerate(refused, 1)], policies, _words())
     return document(title, header, main, el("footer", f"Written by export-model {__version__}.{data}"))
 
 
@@ -149,7 +149,7 @@ def _policy(entry: Entry, number: int, *, alone: bool) -> Markup:
     )
 
 
-def _refused(error: ExportModelError, number: int) -> Markup:
+def _refusal(error: ExportModelError, number: int) -> Markup:
     """What was refused, and why: a part of its own, which is open."""
     title = el("div", el("h2", place_of(error), id=f"refused-{number}"), _REFUSED, class_="title")
     return el("section", title, el("pre", error.message), class_="policy only", aria_labelledby=f"refused-{number}")

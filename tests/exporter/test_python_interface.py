@@ -41,7 +41,7 @@ def test_the_package_offers_its_functions_and_its_version() -> None:
 
 def test_the_public_module_takes_options_in_groups(tmp_path: Path) -> None:
     """The same files as with flat keywords."""
-    assert set(dir(public)) == set(public.__all__) and len(dir(public)) <= 12
+    assert set(dir(public)) == set(public.__all__) and len(dir(public)) <= 13
     assert all(getattr(public, name) is not None for name in dir(public))
     read = public.ReadOptions(brain="StrikerBrain", inputs={"StrikerBrain/state": Role.VECTOR})
     write = public.WriteOptions(names="source", noise="zero", deterministic=True)
@@ -262,6 +262,16 @@ def test_everything_that_comes_back_is_one_line_to_look_at(tmp_path: Path) -> No
     assert repr(result).startswith("<ExportResult 'visual' not verified: bytes in ")
     assert repr(found).startswith("<Inspection of ")
     assert "'observation_0' [B, " in repr(policy)
+
+
+@pytest.mark.parametrize(("ran", "said"), [(("onnxruntime",), "(1 of 4 formats)"), (ALL, "(4 of 4 formats)")])
+def test_a_result_says_how_many_formats_were_looked_at(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ran: tuple[str, ...], said: str
+) -> None:
+    monkeypatch.setattr("converters.runtimes.pool.chosen_runtimes", lambda wanted, formats: (ran, list(KNOWN)))
+    monkeypatch.setattr("converters.runtimes.pool.RuntimePool", ActingPool)
+    (result,) = export_model(BALL, tmp_path)
+    assert repr(result).startswith(f"<ExportResult 'continuous' {result.report.verdict} {said}: bytes, saved_model, ")
 
 
 @pytest.mark.usefixtures("disagreeing")

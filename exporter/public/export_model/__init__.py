@@ -18,19 +18,20 @@ if TYPE_CHECKING:
     from exporter.options import ReadOptions, WriteOptions
     from exporter.play.options import PlayOptions
     from exporter.verify.options import VerifyOptions
-    from signatures.errors import ExportModelError
+    from signatures.errors import ExportModelError, ParityError
 
 _HOMES = {
     **dict.fromkeys(("compare", "export", "inspect", "load", "play", "verify"), "exporter.interface"),
     **dict.fromkeys(("ReadOptions", "WriteOptions"), "exporter.options"),
     "PlayOptions": "exporter.play.options",
     "VerifyOptions": "exporter.verify.options",
-    "ExportModelError": "signatures.errors",
+    **dict.fromkeys(("ExportModelError", "ParityError"), "signatures.errors"),
     "__version__": "exporter",
 }
 
 __all__ = [
     "ExportModelError",
+    "ParityError",
     "PlayOptions",
     "ReadOptions",
     "VerifyOptions",
