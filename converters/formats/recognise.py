@@ -124,13 +124,12 @@ def recognise_path(given: Fetched) -> Format:
     """
     path = given.path
     try:
-        if path.is_dir() or not path.exists():
-            marked = (f for f in FORMATS if f.marker and (path / f.marker).is_file())
-            found = next(marked, None) or next((f for f in FORMATS if f.at is not None and f.at(path)), None)
-            if found is not None:
-                return found
-            if path.is_dir():
-                raise _nothing_in(path)
+        marked = (f for f in FORMATS if f.marker and (path / f.marker).is_file())
+        found = next(marked, None) or next((f for f in FORMATS if f.at is not None and f.at(path)), None)
+        if found is not None:
+            return found
+        if path.is_dir():
+            raise _nothing_in(path)
     except OSError as error:
         raise unreadable(path, error) from error
     return recognise(given.data, path.name)

@@ -31,7 +31,7 @@ def _is_checkpoint(file: Content) -> bool:
 
 
 def _is_prefix(path: Path) -> bool:
-    return bool(path.name) and not path.is_dir() and path.with_name(path.name + ".index").is_file()
+    return bool(path.name) and not path.exists() and path.with_name(path.name + ".index").is_file()
 
 
 _STEPS = frozenset({"step"})

@@ -12,7 +12,7 @@ import numpy as np
 
 from converters.files import tensorflow_messages as schema
 from converters.files.external_data import Detached
-from converters.formats.frozen_graph.tensors import to_array
+from converters.formats.frozen_graph.tensors import lacks_values, to_array
 from converters.graph.nodes import Graph, Node, TensorShape, node_of, normal_ref, topological
 from converters.graph.ops.table import CALLS, is_fed
 from converters.graph.size_limits import Allowance
@@ -39,6 +39,13 @@ def from_graph_def(graph_def: Any, detached: Detached | None = None) -> Graph:
     if not graph_def.node:
         raise NotAPolicyError("the graph has no nodes", fix="give the frozen graph that training wrote")
     schema.check_nodes(len(graph_def.node))
+    if lacks_values(graph_def):
+        raise DamagedFileError(
+            "the graph's constants hold no values",
+            why="they were taken out, as TensorFlow.js before 1.0 did: those of a tensorflowjs_model.pb lie in shards "
+            "beside it, and weights_manifest.json says where",
+            fix="give the folder with all of them, or freeze the graph again",
+        )
     calls = {f.signature.name for f in graph_def.library.function}
     allowance = Allowance()
     nodes = [_node(n, graph_def.versions.producer, allowance, detached) for n in graph_def.node]

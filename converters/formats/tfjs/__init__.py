@@ -10,9 +10,12 @@ if TYPE_CHECKING:
     from converters.formats.tfjs import artifact as _artifact
     from converters.formats.tfjs import reader as _reader
     from converters.formats.tfjs import source as _source
+    from converters.formats.tfjs import split_graph as _split_graph
     from converters.formats.tfjs import writer as _writer
 else:
-    _artifact, _reader, _source, _writer = defer_imports(__name__, "artifact", "reader", "source", "writer")
+    _artifact, _reader, _source, _split_graph, _writer = defer_imports(
+        __name__, "artifact", "reader", "source", "split_graph", "writer"
+    )
 
 FORMATS = (
     Format(
@@ -37,5 +40,12 @@ FORMATS = (
         ),
         predicts=True,
         dtypes=frozenset({"float32", "int32", "bool"}),
+    ),
+    Format(
+        key="tfjs_split_graph",
+        label="a TensorFlow.js model of before 1.0 (a graph and weights_manifest.json)",
+        marker="weights_manifest.json",
+        at=_split_graph.is_part,
+        read=_split_graph.read,
     ),
 )

@@ -32,7 +32,7 @@ _DTYPES = {name: np.dtype(name) for name in _NAMES}
 _MAX_AXES = 32
 #: How many files of a folder are looked into, and how far, for one that is not called model.json.
 _MAX_FILES, _HEAD = 16, 1 << 16
-_FIX = "copy the model again: model.json and all the .bin files beside it"
+_FIX = "copy the model again: model.json (before 1.0: the .pb and its manifest) and all the shards beside it"
 
 
 class WebModel(Struct, frozen=True):
@@ -85,7 +85,7 @@ def read_model(given: Fetched) -> WebModel:
     if "node" not in topology:
         raise NotAPolicyError("is a TensorFlow.js layers model", where=path.name, why="it holds layers, not a graph")
     try:
-        weights, shards = weights_of(model, given)
+        weights, shards = weights_of(model.get("weightsManifest") or [], given, path.parent)
         if topology.get("library", {}).get("function"):
             _refuse_functions(topology)
         graph = Graph(topological([_node(entry, weights) for entry in topology["node"]]))
@@ -137,13 +137,16 @@ def _refuse_functions(topology: Mapping[str, Any]) -> None:
 # ------------------------------------------------------------------ weights
 
 
-def weights_of(model: Mapping[str, Any], given: Fetched) -> tuple[dict[str, np.ndarray], list[Path]]:
-    """(name → value, the shards). Raises DamagedFileError, SourceError."""
+def weights_of(
+    manifest: Sequence[Mapping[str, Any]], given: Fetched, folder: Path
+) -> tuple[dict[str, np.ndarray], list[Path]]:
+    """(name → value, the shards) of a model's groups of weights. Raises DamagedFileError, SourceError."""
     try:
-        return _weights(model.get("weightsManifest") or [], given, model_file(given.path).parent)
+        return _weights(manifest, given, folder)
     except (AttributeError, ArithmeticError, KeyError, TypeError, ValueError) as error:
         raise _damaged_error(
-            f"{MODEL}: its weightsManifest is none", f"{type(error).__name__}: {error}"[:200]
+            "weightsManifest is not in TensorFlow.js's form",
+            f"{type(error).__name__}: {error}"[:200],
         ) from error
 
 
@@ -233,7 +236,10 @@ def _node(entry: Mapping[str, Any], weights: Mapping[str, np.ndarray]) -> Node:
     if op == "Const":
         if name not in weights:
             raise _damaged_error(f"the constant {name!r} has no values", "weightsManifest does not name it")
-        return Node(name, op, value=_reshape_constant(weights[name], entry), origin=f"{name}:0")
+        tensor = ((entry.get("attr") or {}).get("value") or {}).get("tensor")
+        dims = _shape(tensor.get("tensorShape") or {}).dims if tensor else None
+        value = weights[name] if dims is None else reshape_constant(weights[name], dims)
+        return Node(name, op, value=value, origin=f"{name}:0")
     inputs = tuple(normal_ref(i) for i in entry.get("input") or () if not i.startswith("^"))
     node = Node(name, op, inputs, attrs, origin=f"{name}:0")
     if is_fed(node):
@@ -243,11 +249,9 @@ def _node(entry: Mapping[str, Any], weights: Mapping[str, np.ndarray]) -> Node:
     return node
 
 
-def _reshape_constant(value: np.ndarray, entry: Mapping[str, Any]) -> np.ndarray:
+def reshape_constant(value: np.ndarray, dims: Sequence[int | None]) -> np.ndarray:
     """A constant in the shape that the graph says; the manifest may have a scalar as a vector of one."""
-    tensor = ((entry.get("attr") or {}).get("value") or {}).get("tensor")
-    dims = _shape(tensor.get("tensorShape") or {}).dims if tensor else None
-    if dims is None or None in dims or math.prod(d or 0 for d in dims) != value.size:
+    if None in dims or math.prod(d or 0 for d in dims) != value.size:
         return value
     return value.reshape([d or 0 for d in dims])
 

@@ -39,8 +39,9 @@ def _read_layers_model(content: Mapping[str, Any], given: Fetched) -> SourceMode
     from converters.formats.keras.source import of_web_model
     from converters.formats.keras.weights import Listed
 
-    weights, shards = weights_of(content, given)
-    files, topology = (model_file(given.path), *shards), content["modelTopology"]
+    file = model_file(given.path)
+    weights, shards = weights_of(content.get("weightsManifest") or [], given, file.parent)
+    files, topology = (file, *shards), content["modelTopology"]
     return of_web_model(files, topology, Listed([*weights.items()]), content.get("trainingConfig"))
 
 
