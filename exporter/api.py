@@ -30,6 +30,7 @@ class _ReadKeywords(TypedDict, total=False):
     sensors: Sequence[Sequence[int]]
     goals: Sequence[int]
     activation: str | None
+    script: str | None
     normaliser: Path | str | None
     interface: Path | str | None
     trust_source: bool

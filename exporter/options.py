@@ -33,6 +33,8 @@ class ReadOptions(Struct, frozen=True, kw_only=True):
     goals: Sequence[int] = ()
     #: Activation between the layers of a bare ``.pt``.
     activation: str | None = None
+    #: Script that saved a bare ``.pt``, where the names of its layers fit several: ``ppo-pytorch-continuous``.
+    script: str | None = None
     #: File with the statistics that a model of Stable-Baselines3 was trained behind (default: the one next to it), or
     #: ``"none"`` to leave them out.
     normaliser: Path | str | None = None
@@ -52,6 +54,7 @@ class ReadOptions(Struct, frozen=True, kw_only=True):
             trust_source=self.trust_source,
             goals=tuple(self.goals),
             activation=self.activation,
+            script=self.script,
             normaliser=normaliser,
             interface=interface,
         )

@@ -73,6 +73,7 @@ class Origin(Record, frozen=True):
     - ``sensors``: shapes of the agent's sensors (--sensors).
     - ``goals``: which of the sensors are goals, by their place.
     - ``activation``: activation between layers (--activation).
+    - ``script``: script that saved the weights (--script).
     - ``normaliser``: file of the observations' statistics (--normaliser), or none.
     """
 
@@ -83,6 +84,7 @@ class Origin(Record, frozen=True):
     sensors: Annotated[tuple[_Sensor, ...], Meta(max_length=1000)] = ()
     goals: Annotated[tuple[Count, ...], Meta(max_length=1000)] = ()
     activation: Text | None = None
+    script: Text | None = None
     normaliser: Text | None = None
 
 

@@ -27,6 +27,7 @@ _TAKEN = (
     ("step", "a checkpoint or a run's folder"),
     ("sensors", "a .pt"),
     ("activation", "a state dictionary"),
+    ("script", "a state dictionary"),
     ("normaliser", "a saved model of Stable-Baselines3"),
 )
 

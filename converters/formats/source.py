@@ -90,6 +90,7 @@ class ReadOptions(Struct, frozen=True):
     - ``activation``: the one between layers.
     - ``normaliser``: the file with the statistics that observations were normalised by (None: the one beside the
       source; ``NO_NORMALISER``: they are left out).
+    - ``script``: which script saved a state dictionary.
     - ``interface``: the file that states the interface (None: those beside the source; "none": none).
     """
 
@@ -100,3 +101,4 @@ class ReadOptions(Struct, frozen=True):
     activation: str | None = None
     normaliser: str | None = None
     interface: str | None = None
+    script: str | None = None

@@ -8,7 +8,7 @@ from typing import Any
 
 from converters.files.unpickle import Tensor
 from converters.trainers.trainer import Rebuilt, Saved, Trainer
-from signatures.errors import NotAPolicyError
+from signatures.errors import NotAPolicyError, UsageError
 
 #: Rooms of ``converters/trainers``, in the order in which they are asked.
 ROOMS = (
@@ -19,7 +19,7 @@ ROOMS = (
     "rl_games",
     "skrl",
     "sample_factory",
-    "cleanrl",
+    "scripts",
 )
 TRAINERS: tuple[Trainer, ...] = tuple(importlib.import_module(f"converters.trainers.{room}").TRAINER for room in ROOMS)
 #: How a tensor's name begins in the checkpoints of trainers whose networks are not rebuilt (Tianshou 2, RLlib 2).
@@ -32,11 +32,17 @@ _OTHERS: Mapping[str, str] = {
 def rebuild(saved: Saved) -> Rebuilt:
     """The policy of the first trainer that knows what was saved.
 
-    Raises NotAPolicyError where none does, and what the trainer raises.
+    Raises NotAPolicyError where none does, UsageError where it has no scripts and one is named, and what it raises.
     """
     for trainer in TRAINERS:
         found = trainer.recognise(saved)
         if found is not None:
+            if saved.script is not None and not trainer.scripts:
+                raise UsageError(
+                    f"--script says nothing about a checkpoint of {trainer.label}",
+                    why="the names in it tell what computes it",
+                    fix="leave it out",
+                )
             return trainer.rebuild(saved, found)
     raise _unknown_error(saved.value)
 

@@ -23,8 +23,8 @@ class Saved(Struct, frozen=True):
 
     ``archive`` is the file with the tensors; ``settings`` what the trainer wrote beside it in the same source (None:
     nothing). ``sensors`` are the shapes of what is observed, ``goals`` the places of those that are goals,
-    ``activation`` the one between layers: what weights do not tell. ``statistics`` is a file that observations were
-    normalised by, beside the weights: its name and its bytes.
+    ``activation`` the one between layers, ``script`` the one that saved it: what weights do not tell. ``statistics`` is
+    a file that observations were normalised by, beside the weights: its name and its bytes.
     """
 
     given: Fetched
@@ -33,6 +33,7 @@ class Saved(Struct, frozen=True):
     sensors: tuple[tuple[int, ...], ...] = ()
     goals: tuple[int, ...] = ()
     activation: str | None = None
+    script: str | None = None
     statistics: tuple[str, bytes] | None = None
 
     @property
@@ -80,9 +81,11 @@ class Trainer(Struct, frozen=True):
     - ``rebuild`` gives the policy. It raises SourceError for parts that are not known, DamagedFileError, UsageError for
       options that do not fit.
     - ``by_names``: the names of its tensors alone tell it, nothing that lies beside them.
+    - ``scripts``: it is several scripts, of which ``Saved.script`` names one.
     """
 
     label: str
     recognise: Callable[[Saved], Any]
     rebuild: Callable[[Saved, Any], Rebuilt]
     by_names: bool = True
+    scripts: bool = False

@@ -10,10 +10,11 @@ import click
 
 from exporter.cli.console import Console, reporting
 from exporter.cli.group import PATH, command
-from exporter.cli.options import JUDGING, as_given, comparing, located, normalising, pairs, trusting, understanding
+from exporter.cli.options import JUDGING, as_given, comparing, located, pairs, reading, understanding
 
 if TYPE_CHECKING:
     from converters.compiler.options import CompileOptions
+    from converters.formats.source import ReadOptions
     from converters.policy.policy import Policy
     from exporter.verify.options import VerifyOptions
 
@@ -28,19 +29,17 @@ if TYPE_CHECKING:
 @click.argument("reference", type=PATH)
 @click.argument("candidates", nargs=-1, required=True, type=PATH, metavar="CANDIDATE...")
 @click.option("--map", "mapped", multiple=True, metavar="NAME=OTHER", help="What the candidates call one of its names.")
-@trusting
-@normalising
 @located
 @click.option("--allow-unverified", is_flag=True, help="Succeed even if none of their runtimes is installed.")
 @reporting
 @understanding
+@reading("trust_source", "sensors", "activation", "script", "normaliser")
 @comparing
 def compare_command(
     reference: Path,
     candidates: tuple[Path, ...],
     mapped: tuple[str, ...],
-    trust_source: bool,
-    normaliser: Path | str | None,
+    read: ReadOptions,
     runtimes: str,
     allow_unverified: bool,
     compiling: CompileOptions,
@@ -51,11 +50,10 @@ def compare_command(
     from msgspec.structs import replace
 
     from converters.files.fetch import path_text
-    from converters.formats.source import ReadOptions
     from exporter.compare.comparison import CompareOptions, compare_artefacts
     from exporter.reports.entry import Entry
 
-    read: list[Policy] = []
+    understood: list[Policy] = []
     with console.progress() as progress:
         report = compare_artefacts(
             reference,
@@ -64,17 +62,17 @@ def compare_command(
                 names=pairs(mapped, "--map"),
                 judging=replace(options, runtimes=runtimes),
                 understanding=compiling,
-                read=ReadOptions(trust_source=trust_source, normaliser=None if normaliser is None else str(normaliser)),
+                read=read,
                 allow_unverified=allow_unverified,
             ),
             progress=progress,
-            understood=read.append,
+            understood=understood.append,
         )
     console.report_policy(report, ", ".join(map(path_text, candidates)))
     console.json({"reports": [report.to_dict()]})
     command = ("compare", *map(path_text, (reference, *candidates)), *as_given(JUDGING))
     console.write_reports(
-        lambda: [Entry(report, read[0].signature, read[0].graph, steps=options.steps, command=command)]
+        lambda: [Entry(report, understood[0].signature, understood[0].graph, steps=options.steps, command=command)]
     )
     if report.passed is False:
         sys.exit(1)

@@ -11,23 +11,12 @@ import click
 
 from exporter.cli.console import Console, reporting
 from exporter.cli.group import PATH, command
-from exporter.cli.options import (
-    RULES,
-    activating,
-    as_given,
-    coding,
-    comparing,
-    located,
-    normalising,
-    read_options,
-    stating,
-    trusting,
-    understanding,
-)
+from exporter.cli.options import RULES, as_given, coding, comparing, located, reading, understanding
 from exporter.cli.terminal import say_lines
 
 if TYPE_CHECKING:
     from converters.compiler.options import CompileOptions
+    from converters.formats.source import ReadOptions
     from converters.policy.policy import Policy
     from exporter.export.options import ExportOptions
     from exporter.export.pipeline import ExportResult
@@ -70,12 +59,6 @@ if TYPE_CHECKING:
     help="Noise drawn in the graph: an input, kept, or removed.",
 )
 @click.option("--deterministic", is_flag=True, help="Make 'action' the deterministic one.")
-@click.option("--step", type=int, metavar="N", help="The checkpoint of this step (default: the newest).")
-@trusting
-@click.option("--sensors", metavar="SHAPE,...", help="What the agent of a .pt observes: 8,20x4,3x84x84.")
-@activating
-@normalising
-@stating
 @click.option(
     "--dtype",
     type=click.Choice(["float32", "float16"]),
@@ -96,6 +79,7 @@ if TYPE_CHECKING:
 @click.option("--fail-fast", is_flag=True, help="With many sources, stop at the first failure.")
 @reporting
 @understanding
+@reading()
 @comparing
 def export_command(
     sources: tuple[Path, ...],
@@ -105,12 +89,7 @@ def export_command(
     name: str | None,
     opset: int | None,
     runtimes: str,
-    step: int | None,
-    sensors: str | None,
-    activation: str | None,
-    normaliser: Path | str | None,
-    interface: Path | None,
-    trust_source: bool,
+    read: ReadOptions,
     labels: Path | None,
     dtype: str,
     quantize: str | None,
@@ -141,7 +120,7 @@ def export_command(
         targets=None if targets is None else [t for t in targets.split(",") if t],
         name=name,
         compile=compiling,
-        read=read_options(step, sensors, trust_source, activation, normaliser, interface),
+        read=read,
         opset=opset,
         verify=runtimes,
         parity=options,

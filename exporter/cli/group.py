@@ -47,7 +47,7 @@ GROUPS = {
         ),
     ),
     "How to read the source": (
-        *("source", "step", "brain", "inputs", "outputs", "values", "mapped", "sensors", "activation"),
+        *("source", "step", "brain", "inputs", "outputs", "values", "mapped", "sensors", "activation", "script"),
         *("normaliser", "interface", "trust_source"),
     ),
     "What Unity would say": ("releases", "actions", "brain_parameters"),

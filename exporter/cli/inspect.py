@@ -11,13 +11,18 @@ import click
 
 from exporter.cli.export import export_command
 from exporter.cli.group import FILE, PATH, command
-from exporter.cli.options import activating, as_given, normalising, read_options, stating, trusting, understanding
+from exporter.cli.options import as_given, reading, understanding
 from exporter.cli.terminal import say, say_json, say_lines
 from signatures.errors import ExportModelError, UsageError
 
 if TYPE_CHECKING:
     from converters.compiler.options import CompileOptions
     from converters.formats.source import ReadOptions
+
+
+#: What only our readers are told.
+_READERS = ("step", "activation", "script", "normaliser", "interface", "trust_source")
+_UNTOLD = {"trust_source": False}
 
 
 @command(
@@ -31,14 +36,8 @@ if TYPE_CHECKING:
 @click.argument("sources", nargs=-1, required=True, type=PATH, metavar="SOURCE...")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 @click.option("--why", is_flag=True, help="Say which rule decided what each tensor is for.")
-@click.option("--step", type=int, metavar="N", help="The checkpoint of this step (default: the newest).")
 @click.option("--logdir", type=PATH, metavar="DIR", help="Write its graph for TensorBoard.")
 @click.option("--svg", type=PATH, metavar="FILE", help="Draw the policy (with --unity: Behavior Parameters).")
-@trusting
-@click.option("--sensors", metavar="SHAPE,...", help="What the agent (of a .pt) observes: 8,20x4,3x84x84.")
-@activating
-@normalising
-@stating
 @click.option(
     "--unity",
     "releases",
@@ -54,17 +53,13 @@ if TYPE_CHECKING:
     help="With --unity: the agent's sensors and actions, as JSON.",
 )
 @understanding
+@reading()
 def inspect_command(
     sources: tuple[Path, ...],
-    step: int | None,
-    sensors: str | None,
-    activation: str | None,
-    normaliser: Path | str | None,
-    interface: Path | None,
+    read: ReadOptions,
     releases: tuple[str, ...],
     actions: str | None,
     brain_parameters: Path | None,
-    trust_source: bool,
     as_json: bool,
     why: bool,
     logdir: Path | None,
@@ -88,11 +83,7 @@ def inspect_command(
             {
                 "--logdir": logdir is not None,
                 "--why": why,
-                "--step": step is not None,
-                "--activation": activation is not None,
-                "--normaliser": normaliser is not None,
-                "--interface": interface is not None,
-                "--trust-source": trust_source,
+                **{f"--{n.replace('_', '-')}": getattr(read, n) is not _UNTOLD.get(n) for n in _READERS},
                 "--brain, --input, --output or --set": compiling != CompileOptions(),
             }
         )
@@ -101,11 +92,16 @@ def inspect_command(
         try:
             with nearby(source) as here:
                 if releases:
-                    verdict, report = _unity(here, releases, (sensors, actions, brain_parameters), as_json, svg)
+                    verdict, report = _unity(
+                        here,
+                        releases,
+                        (click.get_current_context().params["sensors"], actions, brain_parameters),
+                        as_json,
+                        svg,
+                    )
                     status = max(status, verdict)
                     found.append(report)
                 else:
-                    read = read_options(step, sensors, trust_source, activation, normaliser, interface)
                     found.append(_inspect_source(here, compiling, read, logdir, svg, as_json=as_json, why=why))
                     status = 2 if "refused" in found[-1] else status
         except ExportModelError as error:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 from click.core import ParameterSource
@@ -14,9 +14,6 @@ from click.core import ParameterSource
 from exporter.cli.console import Console
 from exporter.cli.group import FILE
 from signatures.errors import UsageError, suggestion
-
-if TYPE_CHECKING:
-    from converters.formats.source import ReadOptions
 
 
 def pairs(values: Sequence[str], flag: str) -> dict[str, str]:
@@ -77,6 +74,9 @@ JUDGING = frozenset(
             "normaliser",
             "interface",
             "trust_source",
+            "sensors",
+            "activation",
+            "script",
             "source",
             "step",
         ),
@@ -105,22 +105,6 @@ def sensors_of(text: str | None) -> tuple[tuple[tuple[int, ...], ...], tuple[int
     return shapes, tuple(i for i, part in enumerate(parts) if part.startswith("goal:"))
 
 
-def read_options(
-    step: int | None,
-    sensors: str | None,
-    trust_source: bool,
-    activation: str | None,
-    normaliser: Path | str | None,
-    interface: Path | None = None,
-) -> ReadOptions:
-    """What a reader is told, of the command line's words. Raises UsageError."""
-    from converters.formats.source import ReadOptions
-
-    shapes, goals = sensors_of(sensors)
-    files = [None if file is None else str(file) for file in (normaliser, interface)]
-    return ReadOptions(step, shapes, trust_source, goals, activation, *files)
-
-
 #: Where files are run; a word means the same in every command.
 located = click.option(
     "--verify",
@@ -130,20 +114,50 @@ located = click.option(
     metavar="WHERE",
     help="auto, full, browser, none, or runtimes by name.",
 )
-#: For files that have the weights of layers and not what stands between them.
-activating = click.option(
-    "--activation", metavar="NAME", help="Activation between the layers of a bare .pt: elu, tanh, …"
-)
-#: For policies that were trained behind a normaliser of their own.
-normalising = click.option(
-    "--normaliser", type=FILE, metavar="FILE", help="Statistics of a .zip: vecnormalize.pkl, if not next to it."
-)
-#: For policies whose numbers are explained elsewhere than beside them.
-stating = click.option(
-    "--interface", type=FILE, metavar="FILE", help="YAML that states the interface (default: beside), or none."
-)
 #: For sources that only a loader of their own can read, which runs what they say.
 trusting = click.option("--trust-source", is_flag=True, help="Let Keras load what is not plain data; can run code.")
+#: What a source does not say of itself: the name of an option of ``reading``, and the option.
+_READING: Mapping[str, Callable[[Callable[..., Any]], Callable[..., Any]]] = {
+    "step": click.option("--step", type=int, metavar="N", help="The checkpoint of this step (default: the newest)."),
+    "trust_source": trusting,
+    "sensors": click.option("--sensors", metavar="SHAPE,...", help="What the agent of a .pt observes: 8,20x4,3x84x84."),
+    "activation": click.option(
+        "--activation", metavar="NAME", help="Activation between the layers of a bare .pt: elu, tanh, …"
+    ),
+    "script": click.option("--script", metavar="NAME", help="Script that saved a bare .pt: ppo-pytorch-continuous, …"),
+    "normaliser": click.option(
+        "--normaliser", type=FILE, metavar="FILE", help="Statistics of a .zip: vecnormalize.pkl, if not next to it."
+    ),
+    "interface": click.option(
+        "--interface", type=FILE, metavar="FILE", help="YAML that states the interface (default: beside), or none."
+    ),
+}
+
+
+def reading(*names: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Return a decorator for options of ``_READING`` (none named: all); the command gets a ReadOptions, ``read``.
+
+    It stands below ``understanding``, which may say that there is no normaliser.
+    """
+
+    def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(command)
+        def parse_and_call(*args: Any, **rest: Any) -> Any:
+            from converters.formats.source import ReadOptions
+
+            told = {name: rest.pop(name) for name in names or _READING}
+            if "sensors" in told:
+                told["sensors"], told["goals"] = sensors_of(told["sensors"])
+            for name in ("normaliser", "interface"):
+                told[name] = None if told.get(name) is None else str(told[name])
+            return command(*args, read=ReadOptions(**told), **rest)
+
+        made: Callable[..., Any] = parse_and_call
+        for name in names or _READING:
+            made = _READING[name](made)
+        return made
+
+    return decorate
 
 
 #: What ``--set`` says of a normaliser that is to be left out.

@@ -10,10 +10,11 @@ import click
 
 from exporter.cli.console import Console, reporting
 from exporter.cli.group import PATH, command
-from exporter.cli.options import located, pairs, trusting, understanding
+from exporter.cli.options import located, pairs, reading, understanding
 
 if TYPE_CHECKING:
     from converters.compiler.options import CompileOptions
+    from converters.formats.source import ReadOptions
 
 
 @command(
@@ -48,10 +49,10 @@ if TYPE_CHECKING:
 @click.option("--strict", is_flag=True, help="Fail where more episodes are needed to decide, too.")
 @click.option("--partner", type=PATH, metavar="BUNDLE", help="Who plays the other side, where there is one.")
 @click.option("--map", "mapped", multiple=True, metavar="NAME=OTHER", help="What the candidates call one of its names.")
-@trusting
 @located
 @reporting
 @understanding
+@reading("trust_source", "sensors", "activation", "script")
 def play_command(
     reference: Path,
     candidates: tuple[Path, ...],
@@ -64,7 +65,7 @@ def play_command(
     strict: bool,
     partner: Path | None,
     mapped: tuple[str, ...],
-    trust_source: bool,
+    read: ReadOptions,
     runtimes: str,
     compiling: CompileOptions,
     console: Console,
@@ -74,7 +75,6 @@ def play_command(
     Each is fed the states that the reference met, step by step; then each plays whole episodes from the same seeds.
     Without a candidate, the formats of the bundle play, or those that an export of the source would write.
     """
-    from converters.formats.source import ReadOptions
     from exporter.play.options import PlayOptions
     from exporter.play.play import play_policy
     from exporter.verify.options import VerifyOptions
@@ -89,7 +89,7 @@ def play_command(
             partner=partner,
             names=pairs(mapped, "--map"),
             understanding=compiling,
-            read=ReadOptions(trust_source=trust_source),
+            read=read,
             judging=VerifyOptions(runtimes=runtimes, rules=console.rules()),
             progress=progress,
         )

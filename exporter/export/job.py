@@ -138,6 +138,7 @@ def contract_of(
         sensors=read.sensors,
         goals=read.goals,
         activation=read.activation,
+        script=read.script,
         normaliser=None if read.normaliser is None else printable(Path(read.normaliser).name),
     )
     said = None if code is None else code.to_dict() or None

@@ -1,4 +1,4 @@
-"""Checkpoints of rsl_rl and CleanRL's scripts against what their modules gave (fixtures/state_dicts)."""
+"""Checkpoints of rsl_rl, CleanRL's scripts and PPO-PyTorch against what their modules gave (fixtures/state_dicts)."""
 
 from __future__ import annotations
 
@@ -24,8 +24,11 @@ from tests.torch_checkpoint.pt_files import Writer
 ACTIVATIONS = {
     **dict.fromkeys(("rsl_2_3", "rsl_5_5", "rsl_5_5_gru"), "elu"),
     **dict.fromkeys(("rsl_3_1_lstm", "clean_ppo", "clean_ppo_continuous"), "tanh"),
+    **dict.fromkeys(("ppo_pytorch_continuous", "ppo_pytorch_continuous_2022", "ppo_pytorch_discrete"), "tanh"),
     "rsl_3_1_student": "selu",
 }
+#: Where the names of the layers fit several scripts.
+SCRIPTS = {"clean_ppo": "cleanrl-ppo"}
 EYE = ((2, 36, 38),)
 
 
@@ -51,7 +54,8 @@ def saved(folder: Path, name: str, **changed: Any) -> Path:
 
 def options(name: str) -> ReadOptions:
     eye = "atari" in name
-    return ReadOptions(sensors=EYE if eye else (), activation=ACTIVATIONS.get(name, "relu"))
+    script = SCRIPTS.get(name, name.replace("_", "-") if name.startswith("ppo_pytorch") else None)
+    return ReadOptions(sensors=EYE if eye else (), activation=ACTIVATIONS.get(name, "relu"), script=script)
 
 
 @pytest.mark.parametrize("name", sorted(p.stem for p in FOLDER.glob("*.npz")))
@@ -88,10 +92,12 @@ def trunk_of_ones_own(folder: Path) -> Path:
 @pytest.mark.parametrize("name", ["rsl_5_5", "own"])
 def test_the_activation_is_asked_for_where_no_script_tells_it(name: str, tmp_path: Path) -> None:
     path = trunk_of_ones_own(tmp_path) if name == "own" else saved(tmp_path, name)
+    script = "cleanrl-ppo" if name == "own" else None
     with pytest.raises(SourceError, match="does not say which activation") as caught:
-        read_source(path)
+        read_source(path, ReadOptions(script=script))
     assert f"--activation NAME ({'rsl_rl' if name == 'rsl_5_5' else 'CleanRL'}" in str(caught.value)
-    exported = export_model(path, "-o", tmp_path / "out", "--activation", "elu", "--verify", "none")
+    which = ("--script", script) if script else ()
+    exported = export_model(path, "-o", tmp_path / "out", "--activation", "elu", *which, "--verify", "none")
     assert exported.status == 0, exported.err
     again = export_model(
         "verify", tmp_path / "out" / name, "--source", path, "--runtimes", "numpy", "--allow-unverified"
@@ -99,15 +105,16 @@ def test_the_activation_is_asked_for_where_no_script_tells_it(name: str, tmp_pat
     assert again.status == 0, again.err
 
 
-@pytest.mark.parametrize("name", sorted(p.stem for p in FOLDER.glob("clean_*.npz")))
-def test_the_activation_of_cleanrls_script_is_the_default_and_said(name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", sorted(p.stem for p in FOLDER.glob("*.npz") if p.stem[:3] in ("cle", "ppo")))
+def test_the_activation_of_a_script_is_the_default_and_said(name: str, tmp_path: Path) -> None:
     """The weights and answers of the fixtures are of the scripts' own classes."""
     path, told = saved(tmp_path, name), options(name)
     (given,) = read_source(path, told).policies()
     (taken,) = read_source(path, replace(told, activation=None)).policies()
     assert [(n.op, n.inputs) for n in taken.graph.nodes] == [(n.op, n.inputs) for n in given.graph.nodes]
     (note,) = set(taken.signature.notes) - set(given.signature.notes)
-    assert f"taken to be {told.activation}, as in CleanRL's" in note
+    maker = "CleanRL" if name.startswith("clean") else "PPO-PyTorch"
+    assert f"taken to be {told.activation}, as in {maker}'s" in note
     assert "--activation NAME" in note
 
 

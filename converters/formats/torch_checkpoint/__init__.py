@@ -1,4 +1,4 @@
-"""PyTorch checkpoints (``.pt``): of ML-Agents, rsl_rl, rl_games, skrl, Sample Factory, CleanRL."""
+"""PyTorch checkpoints (``.pt``): of ML-Agents, rsl_rl, rl_games, skrl, Sample Factory, CleanRL, PPO-PyTorch."""
 
 from __future__ import annotations
 
@@ -24,6 +24,6 @@ FORMATS = (
         label="a PyTorch checkpoint (.pt)",
         sniff=_sniff,
         read=_source.read,
-        takes=frozenset({"sensors", "activation"}),
+        takes=frozenset({"sensors", "activation", "script"}),
     ),
 )
