@@ -12,7 +12,7 @@ from itertools import zip_longest
 
 from signatures.fields import printable
 
-#: No column is made narrower.
+#: No column is made narrower where words have to be broken.
 _LEAST = 8
 _GAP = 2
 #: A column of sentences has this much before names are broken.
@@ -54,9 +54,9 @@ def _fitting(columns: Sequence[Sequence[str]], total: int | None) -> list[int]:
     free = total - _GAP * (len(widths) - 1)
     words = [max(len(word) for cell in cells for word in (*cell.split(), "")) for cells in columns]
     words = [max(n, min(w, _SENTENCE)) if w > 2 * _SENTENCE else n for n, w in zip(words, widths, strict=True)]
-    for least in (words, [_LEAST] * len(widths)):
+    for least, lowest in ((words, 1), ([_LEAST] * len(widths), _LEAST)):
         limit, natural = max(widths, default=0), widths
-        while limit > _LEAST and sum(widths) > free:
+        while limit > lowest and sum(widths) > free:
             limit -= 1
             widths = [min(w, max(limit, n)) for w, n in zip(natural, least, strict=True)]
     return widths

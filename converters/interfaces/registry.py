@@ -83,6 +83,10 @@ def files_beside(source: Path) -> Iterator[tuple[InterfaceFile, Path]]:
                     yield kind, place / name
 
 
+#: In a note on a file that could not be read.
+LEFT_OUT = "beside the source is left out"
+
+
 def _names(place: Path, pattern: str) -> list[str]:
     """The names in a folder that match; only that of descriptors, which has few, is looked through."""
     if place.name != _DESCRIPTORS or "*" not in pattern:
@@ -113,7 +117,7 @@ def read_beside(source: Path, name: str | None, wanted: str | None) -> tuple[Int
             stated = _of_kind(kind, path, source.name, behavior)
         except ExportModelError as error:
             hint = f"; {error.fix}" if error.fix else ""
-            notes.append(printable(f"{path.name} beside the source is left out: {error.what}{hint}"[:500]))
+            notes.append(printable(f"{path.name} {LEFT_OUT}: {error.what}{hint}"[:500]))
             continue
         if stated is not None:
             found, conflicts = (stated, ()) if found is None else merge(found, stated)

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from exporter.acting.generator import Generator, likeliest
 from signatures.batches import Run
-from signatures.errors import BundleError, UsageError
+from signatures.errors import BundleError, UsageError, suggestion
 from signatures.ids import check_ids
 from signatures.roles import OBSERVATIONS, Role
 from signatures.spec import ActionHead, PolicySignature, TensorSpec
@@ -166,12 +166,12 @@ class LoadedPolicy:
             if len(names) != 1:
                 raise UsageError(f"the policy has {len(names)} observations", fix=f"give a dict of {known}")
             return {names[0]: observations}
+        for name in observations:
+            if name not in names:
+                raise UsageError(f"unknown observation {name!r}", fix=f"{suggestion(name, names)}there are {known}")
         for name in names:
             if name not in observations:
                 raise UsageError(f"the observation {name!r} is missing", fix=f"there are {known}")
-        for name in observations:
-            if name not in names:
-                raise UsageError(f"unknown observation {name!r}", fix=f"there are {known}")
         return dict(observations)
 
     def _check_parameters(self, given: Mapping[str, npt.ArrayLike]) -> None:

@@ -16,13 +16,22 @@ from exporter.cli.group import FILE
 from signatures.errors import UsageError, suggestion
 
 
+#: A value that each option of pairs takes.
+_EXAMPLES = {
+    "--map": "action=Identity",
+    "--input": "obs=vector_observation",
+    "--output": "Identity=continuous",
+    "--set": "speed=0.5",
+}
+
+
 def pairs(values: Sequence[str], flag: str) -> dict[str, str]:
     """NAME=VALUE, given any number of times. Raises UsageError."""
     found = {}
     for value in values:
         name, equals, rest = value.partition("=")
         if not equals or not name or not rest:
-            raise UsageError(f"{flag} {value}: NAME=VALUE is expected", fix=f"for example {flag} action=Identity")
+            raise UsageError(f"{flag} {value}: NAME=VALUE is expected", fix=f"for example {flag} {_EXAMPLES[flag]}")
         found[name] = rest
     return found
 

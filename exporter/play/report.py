@@ -96,31 +96,21 @@ class PlayReport(Struct, frozen=True):
     def lines(self) -> Iterator[str]:
         """A table of everything that played, then what is wrong or open."""
         replayed = {(p.format, p.runtime): p.word for p in self.replay.pairs}
-        head = (
-            "format",
-            "runtime",
-            "replay",
-            "mean return",
-            "difference",
-            "95% interval",
-            "equal",
-            "decisions/s",
-            "verdict",
-        )
+        difference = f"difference ({CONFIDENCE:.0%} interval)"
+        head = ("player", "replay", "mean return", difference, "equal", "per second", "verdict")
         own, rows = self.episodes, []
-        mean = figure(own.returns.mean())
-        rows.append([self.reference, "", "recorded", mean, "", "", "", f"{own.rate:,.0f}", "reference"])
+        rows.append([self.reference, "", figure(own.returns.mean()), "", "", f"{own.rate:,.0f}", "reference"])
         for p in self.played:
             c = p.compared
             word = replayed.get((p.format, p.runtime), "-")
-            interval = f"{signed_text(c.low)} to {signed_text(c.high)}"
+            interval = f"{signed_text(c.difference)} ({signed_text(c.low)} to {signed_text(c.high)})"
             equal = f"{c.equal} of {c.episodes}"
             mean, rate = figure(p.episodes.returns.mean()), f"{p.episodes.rate:,.0f}"
-            rows.append([p.format, p.runtime, word, mean, signed_text(c.difference), interval, equal, rate, c.verdict])
+            rows.append([p.where, word, mean, interval, equal, rate, c.verdict])
         playing = {(p.format, p.runtime) for p in self.played}
         kept = {"weights", "source"}  # no artefacts: what rounding changed, and an original that died
         silent = [p for p in self.replay.pairs if (p.format, p.runtime) not in playing and p.format not in kept]
-        rows += [[p.format, p.runtime, p.word, "", "", "", "", "", "did not play"] for p in silent]
+        rows += [[f"{p.format} in {p.runtime}", p.word, "", "", "", "", "did not play"] for p in silent]
         yield from table(head, rows).splitlines()
         for finding in self.replay.failures:
             yield from finding.explanation()

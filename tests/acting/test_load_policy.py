@@ -148,6 +148,7 @@ def test_what_is_missing_or_wrong_is_named(bundles: Bundles) -> None:
         ({}, f"'{name}' is missing"),
         ({name: np.zeros((2, 99))}, r"has the shape \[2, 99\]"),
         ({name: observed(policy)[name], "stat": 0}, "unknown observation 'stat'"),
+        ({"stat": 0}, "unknown observation 'stat'"),
     ):
         with pytest.raises(UsageError, match=words):
             policy.decide(observations)

@@ -154,6 +154,7 @@ def test_what_is_missing_or_wrong_is_named(bundles: Bundles) -> None:
         ({"observations": {}}, "the observation 'state' is missing"),
         ({"observations": {"state": [0.0] * 7}}, "'state' has 7 numbers; [agents, 8] is wanted"),
         ({"observations": {"state": [0.0] * 8, "stat": 1}}, "unknown observation 'stat'"),
+        ({"observations": {"stat": [0.0] * 8}}, "unknown observation 'stat'"),
         ({"observations": [0.0] * 8, "options": {"seed": -1}}, "the seed is -1"),
         ({"observations": {"state": [[0.0] * 6] * 4}}, "[agents, 8] is wanted"),
         ({"observations": {"state": [[0.0] * 4] * 2}}, "[agents, 8] is wanted"),

@@ -382,3 +382,12 @@ def test_a_disk_that_is_full_at_the_report_leaves_nothing_behind(
     monkeypatch.setattr(Path, "write_bytes", full_at_the_report)
     is_refused(export_model(ball, "-o", tmp_path / "out", "--verify", "numpy"), "No space left on device")
     assert files_in(tmp_path / "out") == set()
+
+
+@pytest.mark.parametrize("flag", ["--input", "--output", "--set"])
+def test_the_example_of_an_option_is_one_that_it_takes(flag: str, out: Path) -> None:
+    message = is_refused(export_model(BALL, flag, "foo", "-o", out), "NAME=VALUE is expected")
+    _, _, example = message.partition(f"for example {flag} ")
+    name = example.split()[0].partition("=")[0]
+    said = is_refused(export_model(BALL, flag, example.split()[0], "-o", out), f"{name!r}" if flag == "--set" else name)
+    assert "unknown role" not in said and "is expected" not in said

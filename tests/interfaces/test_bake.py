@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -93,7 +94,7 @@ def test_every_format_agrees_and_the_source_is_baked_anew(tmp_path: Path) -> Non
 def test_nothing_stated_or_a_consumer_is_refused(tmp_path: Path) -> None:
     path = run_with(tmp_path)
     ran = export_model(path, "-o", tmp_path / "out", "--bake", "actions")
-    assert ran.status == 2 and "nothing states a scale" in ran.err
+    assert ran.status == 2 and "states a scale" in ran.err
     ran = baked(tmp_path, "--for", "unity6")
     assert ran.status == 2 and "does not go with --for" in ran.err
     ran = baked(tmp_path, "--env", "3DBall")
@@ -190,3 +191,12 @@ def test_a_contract_that_hides_what_is_baked_is_found(tmp_path: Path) -> None:
     (folder / "policy.json.bak").unlink()
     ran = export_model("verify", folder, "--source", path, "--runtimes", "onnxruntime")
     assert ran.status in (1, 2), ran.out
+
+
+def test_a_file_that_was_not_read_is_named_where_it_was_needed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """deploy.yaml states the scale; without PyYAML the answer must not be that nothing does."""
+    monkeypatch.setitem(sys.modules, "yaml", None)
+    ran = baked(tmp_path, "--verify", "none")
+    assert ran.status == 2
+    for words in ("nothing that was read states", "deploy.yaml", "PyYAML is not installed", "export-model[robots]"):
+        assert words in ran.err

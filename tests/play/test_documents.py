@@ -108,3 +108,20 @@ def test_the_command_writes_them(bundles: Path, tmp_path: Path) -> None:
     assert ran.status == 0, ran.err
     assert all(file.read_bytes() for file in files.values())
     is_refused(export_model("play", *where, "--junit", files["html"], "--html", files["html"]), "named for two reports")
+
+
+@pytest.mark.parametrize("columns", ["80", "200"])
+def test_the_table_breaks_no_word_on_a_terminal(
+    reports: dict[str, PlayReport], monkeypatch: pytest.MonkeyPatch, columns: str
+) -> None:
+    """Also with the longest names that runtimes have."""
+    (played,) = reports[DIFFERENT].played
+    far = replace(played, format="saved_model", runtime="onnxruntime-web@chromium")
+    report = replace(reports[DIFFERENT], reference="GridWorld", played=(played, far))
+    monkeypatch.setenv("COLUMNS", "1000")
+    whole = sorted(word for line in report.lines() for word in line.split() if set(word) != {"-"})
+    monkeypatch.setenv("COLUMNS", columns)
+    lines = list(report.lines())
+    assert sorted(word for line in lines for word in line.split() if set(word) != {"-"}) == whole
+    table = lines[: len(lines) - sum(bool(p.sentence) for p in report.played)]
+    assert max(map(len, table[:8])) <= int(columns)

@@ -14,6 +14,7 @@ from msgspec.structs import replace
 
 from converters.graph.nodes import Graph, NameScope, Node, topological
 from converters.interfaces.isaac_lab import RAW_ACTION
+from converters.interfaces.registry import LEFT_OUT
 from converters.policy.policy import Policy
 from signatures.errors import UsageError
 from signatures.interface import Interface, Range, Term
@@ -37,7 +38,12 @@ def bake_actions(policy: Policy) -> Policy:
     if interface is None or not (raw or any(term.changes for term in interface.actions)):
         if interface is not None and interface.baked:
             return replace(policy, signature=replace(signature, notes=(*signature.notes, ALREADY)))
-        raise UsageError("--bake actions: nothing states a scale, an offset or a clip of the action", fix=_GIVE)
+        unread = "\n".join(note for note in signature.notes if LEFT_OUT in note)
+        raise UsageError(
+            "--bake actions: nothing that was read states a scale, an offset or a clip of the action",
+            why=unread or None,
+            fix=f"read what was left out, or {_GIVE}" if unread else _GIVE,
+        )
     width = head.spec.shape[-1] or 0
     steps = [_Step(raw[0].clip * width if len(raw[0].clip) == 1 else raw[0].clip)] if raw else []
     steps.append(_whole(interface.actions, width))

@@ -325,11 +325,11 @@ export class Policy {
       if (names.length !== 1) throw new Error(`the policy has ${names.length} observations: give { ${names.join(", ")} }`);
       return { [names[0]]: observations };
     }
-    for (const name of names) {
-      if (observations[name] === undefined) throw new Error(`the observation '${name}' is missing; there are ${names}`);
-    }
     for (const name of Object.keys(observations)) {
       if (!names.includes(name)) throw new Error(`unknown observation '${name}'; there are ${names}`);
+    }
+    for (const name of names) {
+      if (observations[name] === undefined) throw new Error(`the observation '${name}' is missing; there are ${names}`);
     }
     return observations;
   }
