@@ -15,7 +15,6 @@ from exporter.cli.console import Console
 from exporter.cli.group import FILE
 from signatures.errors import UsageError, suggestion
 
-
 #: A value that each option of pairs takes.
 _EXAMPLES = {
     "--map": "action=Identity",
