@@ -33,6 +33,7 @@ from exporter.verify.report import ParityReport
 from signatures.roles import Role
 from signatures.spec import PolicySignature
 from tests.corpus.conftest import SHARED, frozen_corpus, genuine_cases
+from tests.faults.page import section
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 FIGURES, PAGE = DOCS / "figures.json", DOCS / "figures.md"
@@ -262,6 +263,7 @@ def page(content: Mapping[str, Any]) -> str:
         *(_litert(content["litert"]) if "litert" in content else []),
         *(_litert_web(content["litert-web"]) if "litert-web" in content else []),
         *(_programs(content["programs"]) if "programs" in content else []),
+        *(section(content["faults"]) if "faults" in content else []),
     ]
     return "\n".join(lines).rstrip() + "\n"
 
@@ -416,7 +418,7 @@ def main() -> int:
         if options.only:
             print(page(content))
             return 1 if content["failed"] else 0
-        kept = {key: before[key] for key in ("unity", "litert", "litert-web", "programs") if key in before}
+        kept = {key: before[key] for key in ("unity", "litert", "litert-web", "programs", "faults") if key in before}
         FIGURES.write_text(json.dumps({**content, **kept}, indent=1) + "\n", encoding="utf-8")
     content = json.loads(FIGURES.read_text(encoding="utf-8"))
     PAGE.write_text(page(content), encoding="utf-8")

@@ -1,0 +1,143 @@
+"""``python -m tests.faults``: faults of every class, planted into what export writes for policies of every family.
+
+Without flags a sample of policies of fixtures/, as ``make test`` has it. ``--whole`` has every class once in every
+policy of fixtures/ and ../shared (hours), ``--every`` every tensor that can have it; ``--write`` keeps the table in
+docs/figures.json, from which docs/figures.md is written.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import json
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+from converters.runtimes.pool import RuntimePool
+from signatures.errors import ExportModelError
+from tests.faults.families import Member, members, shared
+from tests.faults.judging import Fault, Outcome, Subject
+from tests.faults.page import totals
+from tests.figures import FIGURES, PAGE, page
+
+#: Faults of a member of the sample, and members of a family in one format.
+SAMPLED, OF_A_FAMILY = 4, 2
+
+
+def sample(given: Iterable[Member]) -> list[Member]:
+    """The first members of every family in every format."""
+    counts = Counter[tuple[str, str]]()
+    found = []
+    for member in given:
+        counts[member.family, member.form] += 1
+        if counts[member.family, member.form] <= (OF_A_FAMILY if member.form == "onnx" else 1):
+            found.append(member)
+    return found
+
+
+class Turns:
+    """Chooses the faults of one member after another: what was planted least, on another tensor each time."""
+
+    def __init__(self) -> None:
+        self._planted = Counter[str]()
+        self._families = Counter[tuple[str, str]]()
+
+    def choose(self, family: str, faults: Sequence[Fault], count: int | None) -> list[Fault]:
+        """``count`` of them, a class each; of every class one for None."""
+        kinds: dict[str, list[Fault]] = {}
+        for fault in faults:
+            kinds.setdefault(fault.kind, []).append(fault)
+        order = sorted(kinds, key=lambda k: (self._families[family, k], self._planted[k]))
+        chosen = []
+        for kind in order[: len(order) if count is None else count]:
+            chosen.append(kinds[kind][self._planted[kind] % len(kinds[kind])])
+            self._planted[kind] += 1
+            self._families[family, kind] += 1
+        return chosen
+
+
+def outcomes(
+    given: Iterable[Member],
+    pool: RuntimePool,
+    *,
+    count: int | None = None,
+    every: bool = False,
+    ways: Sequence[str] = (),
+) -> Iterator[Outcome]:
+    """What comes of each fault, each judged in one way in turn (``ways``: in these); a policy without one first."""
+    turns = Turns()
+    for number, member in enumerate(given):
+        with tempfile.TemporaryDirectory() as folder:
+            try:
+                subject = Subject(member, Path(folder), pool)
+            except ExportModelError:  # it is refused in this format, or for this consumer
+                continue
+            possible = [w for w in subject.ways() if not ways or w in ways]
+            faults = list(subject.faults())
+            sound = {way: subject.judge(None, way) for way in possible} if count is None else {}
+            yield from sound.values()
+            possible = [w for w in possible if w not in sound or sound[w].verdict == "passed"]
+            for place, fault in enumerate(faults if every else turns.choose(member.family, faults, count)):
+                for way in possible if ways else possible[(number + place) % max(len(possible), 1) :][:1]:
+                    yield subject.judge(fault, way)
+
+
+def counted(found: Sequence[Outcome]) -> dict[str, Any]:
+    """The table, as JSON: families → classes → [caught, located, planted]; what was missed, and what has no effect."""
+    cells: dict[str, dict[str, list[int]]] = {}
+    for each in (o for o in found if o.verdict in ("caught", "missed") and o.kind != "no fault"):
+        cell = cells.setdefault(each.family, {}).setdefault(each.kind, [0, 0, 0])
+        cell[0] += each.verdict == "caught"
+        cell[1] += each.located
+        cell[2] += 1
+    return {
+        "date": datetime.datetime.now(tz=datetime.UTC).date().isoformat(),
+        "policies": len({o.member for o in found}),
+        "cells": cells,
+        "missed": [asdict(o) for o in found if o.verdict == "missed"],
+        "without_effect": [f"{o.member}: {o.kind} at {o.tensor}" for o in found if o.verdict == "no effect"],
+        "alarms": [str(o) for o in found if o.kind == "no fault" and o.verdict != "passed"],
+    }
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m tests.faults", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--whole", action="store_true", help="every class in every policy of fixtures/ and ../shared")
+    parser.add_argument("--every", action="store_true", help="every class at every tensor that can have it")
+    parser.add_argument("--only", default="", help="only policies whose family, name or format holds this")
+    parser.add_argument("--ways", default="", help="export, verify, compare: each fault in all of these")
+    parser.add_argument("--write", action="store_true", help="keep the table in docs/figures")
+    options = parser.parse_args()
+    given = chain(members(), shared()) if options.whole else members() if options.only else sample(members())
+    given = (m for m in given if options.only in f"{m.family} {m.label}")
+    found = []
+    with RuntimePool() as pool:
+        ways = [w for w in options.ways.split(",") if w]
+        count = None if options.whole or options.only else SAMPLED
+        for outcome in outcomes(given, pool, count=count, every=options.every, ways=ways):
+            found.append(outcome)
+            if outcome.verdict in ("missed", "no effect") or (outcome.kind, outcome.verdict) == ("no fault", "caught"):
+                print(outcome, flush=True)
+    content = counted(found)
+    if options.write:
+        before = json.loads(FIGURES.read_text(encoding="utf-8"))
+        kept = {**before, "faults": content}
+        FIGURES.write_text(json.dumps(kept, indent=1) + "\n", encoding="utf-8")
+        PAGE.write_text(page(kept), encoding="utf-8")
+    caught, located, planted = totals(content)
+    print(
+        f"{planted} faults in {content['policies']} policies: {caught} caught, {located} located, "
+        f"{planted - caught} missed; {len(content['without_effect'])} more change nothing; "
+        f"{len(content['alarms'])} alarms without a fault"
+    )
+    return 1 if content["missed"] or content["alarms"] else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
