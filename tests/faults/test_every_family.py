@@ -19,7 +19,7 @@ OPEN = {
     "source code": ("act with twice the noise", "act without noise"),
     "profiles": (
         *("a forbidden class", "temperature × 1.2", "2 % at random", "the first row's for all", "× 0"),
-        "no chance where obs[0] > 0.2",
+        *("no chance where obs[0] > 0.2", "reversed", "+ 5 where obs[0] > 0.2"),
     ),
     "interfaces": ("metadata: joint_names", "metadata: default_joint_pos", "metadata: action_scale"),
 }
