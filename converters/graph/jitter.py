@@ -29,6 +29,10 @@ _UNIT = 0.75 / (2 * math.log(2))
 #: numbers are onnxruntime 1.31's and TensorFlow 2.21's answers, but for a unit or two in the last place.
 _LANES = (1, 4, 8)
 
+#: Arithmetic of two that every runtime computes alike where float32 holds the very result. A quotient is not: shaders
+#: multiply by a reciprocal.
+_EXACT_AT_TIMES = frozenset(("factor", "summand", "subtrahend"))
+
 #: The exponent of a float32, where its bits are, whose last place is the smallest number that has all digits.
 _FEW_DIGITS = np.uint32(23 << 23)
 
@@ -62,6 +66,8 @@ class Jitter:
             results = self._added_up(entry, node, operands, results)
         known = self._approximations.get(entry.name, _ELSE if entry.precision == "approximate" else (1.0, 0.0))
         moved = [self._perturb(r, *known) for r in results]
+        if entry.operand in _EXACT_AT_TIMES:
+            moved = [_keep_exact(entry, node, operands, r, m) for r, m in zip(results, moved, strict=True)]
         return [r.clip(*RANGES[entry.name]) for r in moved] if entry.name in RANGES else moved
 
     def _signs(self, shape: tuple[int, ...]) -> np.ndarray:
@@ -118,6 +124,25 @@ class Jitter:
                 return np.where(np.isfinite(step), result + signs * step, result).astype(result.dtype)
 
             return [_piecewise(move, *pair) for pair in zip(results, squares, strict=True)]
+
+
+def _keep_exact(
+    entry: OpDef, node: Node, operands: Sequence[np.ndarray], result: np.ndarray, moved: np.ndarray
+) -> np.ndarray:
+    """``moved`` with the elements of ``result`` that were not rounded as they are: ×±1, ×2ⁿ, ×0, sums of few digits.
+
+    A mask's ``(1 - mask)·1e8`` would otherwise be 12 off where it is 0. Of float64 nothing here says which they are.
+    """
+    if result.dtype != np.float32 or not result.size or any(a.dtype != np.float32 for a in operands):
+        return moved
+    shape = result.shape or (1,)
+    spread, exact, into = [np.broadcast_to(a, shape) for a in operands], result.reshape(shape), moved.reshape(shape)
+    rows = max(1, _AT_ONCE * shape[0] // result.size)
+    for first in range(0, shape[0], rows):
+        part = slice(first, first + rows)
+        (whole,) = run_kernel(entry, node, [a[part].astype(np.float64) for a in spread])
+        np.copyto(into[part], exact[part], where=whole == exact[part])
+    return into.reshape(result.shape)
 
 
 def _in_other_order(entry: OpDef, operands: Sequence[np.ndarray], result: np.ndarray) -> np.ndarray:

@@ -12,11 +12,8 @@ import numpy as np
 
 from converters.graph.jitter import Jitter
 from converters.graph.nodes import Node
-from converters.graph.ops.approximations import RANGES
+from converters.graph.ops.approximations import RANGES, TINY
 from converters.graph.ops.base import OpDef
-
-#: The smallest float32 that has all its digits; a runtime may take what is smaller for zero.
-TINY = np.finfo(np.float32).tiny
 
 
 class Ends(Jitter):

@@ -147,6 +147,30 @@ def test_what_is_moved_piece_by_piece_is_moved_as_the_whole_is(
     assert pieces == moved()
 
 
+@pytest.mark.parametrize("piece", [100, 1 << 16])
+@pytest.mark.parametrize(
+    ("op", "left", "right", "moves"),
+    [
+        ("Mul", [1.0, 3.1, 0.0, 7.7], -1.0, [False] * 4),
+        ("Mul", [1.1, 3.1, 0.0, 7.7], 2.0**-7, [False] * 4),
+        ("Mul", [1.1, 3.1, 0.0, 3.0], 1e8, [True, True, False, False]),
+        ("Mul", [1.1, 3.1, 0.0, 7.7], 0.1, [True, True, False, True]),
+        ("Add", [-1.0, 0.0, -0.5, 0.1], 1.0, [False, False, False, True]),
+        ("Sub", [0.0, 8.0, -0.5, 0.1], 1e8, [False, False, True, True]),
+        ("RealDiv", [1.0, 2.0, 4.0, 8.0], 2.0, [True] * 4),  # a shader multiplies by a reciprocal
+    ],
+)
+def test_what_is_not_rounded_is_not_moved(
+    op: str, left: list[float], right: float, moves: list[bool], piece: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A mask's (1 - mask)·1e8 is exact: moved by one unit in the last place of 1, it would open every choice."""
+    monkeypatch.setattr("converters.graph.jitter._AT_ONCE", piece)
+    made = graph(placeholder("x", (None, 4)), const("c", right, np.float32), node("y", op, "x", "c"))
+    feeds = {"x": np.repeat(np.float32([left]), 300, axis=0)}
+    exact = run_graph(made, feeds, ["y"])["y"]
+    assert (run_graph(made, feeds, ["y"], Jitter(1))["y"] != exact).all(axis=0).tolist() == moves
+
+
 @pytest.mark.parametrize("turned", [False, True])
 @pytest.mark.parametrize("piece", [100, 1 << 16])
 def test_a_product_of_squares_is_that_of_the_squared_operands(
