@@ -94,10 +94,12 @@ class Choices:
         best_first = np.argsort(-scores if traits(node).chooses == "largest" else scores, axis=-1, kind="stable")
         ordered = np.take_along_axis(scores, best_first, axis=-1)[..., : _RIVALS + 1]
         best = ordered[..., :1]
-        bound = tolerance.atol + tolerance.rtol * np.abs(best)
-        margin = 2 * np.maximum(bound, off.max(axis=-1, keepdims=True, initial=0))
+        bound = np.maximum(
+            tolerance.atol + tolerance.rtol * np.abs(best),
+            np.take_along_axis(off, best_first, axis=-1)[..., : _RIVALS + 1],
+        )
         with np.errstate(invalid="ignore"):
-            near = ~(np.abs(best - ordered) > margin)
+            near = ~(np.abs(best - ordered) > bound + bound[..., :1])
         return best_first[..., : _RIVALS + 1], near
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -179,12 +180,11 @@ def wrong(reason: str) -> Difference:
     return Difference(float("inf"), float("inf"), False, reason, share=float("inf"))
 
 
-def row_steps(exact: np.ndarray, moved: np.ndarray) -> np.ndarray:
-    """How far a value moved, element by element: the largest of a row counts for all of it, what is not finite not."""
+def steps(exact: np.ndarray, moved: np.ndarray) -> np.ndarray:
+    """How far each value moved; 0 where that is not finite."""
     with np.errstate(invalid="ignore"):
         step = np.abs(moved.astype(np.float64) - exact)
-    row = step.max(axis=tuple(range(1, step.ndim)), keepdims=True)
-    return np.broadcast_to(np.where(np.isfinite(row), row, 0.0), step.shape)
+    return np.where(np.isfinite(step), step, 0.0)
 
 
 def spread(answers: Sequence[np.ndarray]) -> np.ndarray | None:
@@ -205,25 +205,27 @@ def spread(answers: Sequence[np.ndarray]) -> np.ndarray | None:
 
 
 def floor_log_probs(log_probs: np.ndarray, branches: Sequence[int]) -> np.ndarray:
-    """Log-probabilities with those that say "never" brought to one value: 2⁻¹²⁶ of the likeliest class of the branch.
+    """Log-probabilities with those that say "never" brought to one value: n·2⁻¹²⁶ of the likeliest of n classes.
 
-    Below it a float32 probability is denormal or zero: its logarithm has few digits left, is −∞ where it is flushed to
-    zero, and is −10⁸ where a runtime takes log(softmax(x)) as one function (TensorFlow's grappler does).
+    Below it a float32 probability is denormal or zero (the likeliest has 1/n or more): its logarithm has few digits
+    left, is −∞ where it is flushed to zero, and is −10⁸ where a runtime takes log(softmax(x)) as one function
+    (TensorFlow's grappler does).
     """
     sizes = branches if sum(branches) == log_probs.shape[-1] else (log_probs.shape[-1],)
     parts = []
     for part in np.split(log_probs, np.cumsum(sizes)[:-1], axis=-1):
         best = part.max(axis=-1, keepdims=True, initial=-np.inf)
-        parts.append(np.maximum(part, best + part.dtype.type(_UNDERFLOW)))
+        least = _UNDERFLOW + math.log(max(1, part.shape[-1]))
+        parts.append(np.maximum(part, best + part.dtype.type(least)))
     return np.concatenate(parts, axis=-1)
 
 
-def ties(
+def near_best(
     scores: np.ndarray, branches: Sequence[int], tolerance: Tolerance, rounding: np.ndarray | None = None
 ) -> np.ndarray:
-    """[B, branches]: where the two best scores of a branch are too close for the argmax to be decided.
+    """[B, ΣB]: which classes may be the best of their branch, as the best score or their own is within its bound.
 
-    Each of the two may be off by the tolerance, or by what ``rounding`` explains of it.
+    Each of the two may be off by the tolerance, or by what ``rounding`` explains of it. NaN decides nothing.
     """
     columns = []
     start = 0
@@ -231,14 +233,21 @@ def ties(
         part = scores[:, start : start + size].astype(np.float64)
         moved = np.zeros(part.shape) if rounding is None else rounding[:, start : start + size]
         start += size
-        if size < 2:
-            columns.append(np.zeros(part.shape[0], bool))
-            continue
-        top = np.sort(part, axis=1)[:, -2:]
-        margin = 2 * np.maximum(tolerance.atol + tolerance.rtol * np.abs(top[:, 1]), moved.max(axis=1))
+        place = part.argmax(axis=1)[:, None]
+        best = np.take_along_axis(part, place, axis=1)
+        off = np.maximum(tolerance.atol + tolerance.rtol * np.abs(best), moved)
         with np.errstate(invalid="ignore"):
-            columns.append(~(top[:, 1] - top[:, 0] > margin))
-    return np.stack(columns, axis=1)
+            far = best - part > off + np.take_along_axis(off, place, axis=1)
+        columns.append(~far | (part == best))
+    return np.concatenate(columns, axis=1)
+
+
+def ties(
+    scores: np.ndarray, branches: Sequence[int], tolerance: Tolerance, rounding: np.ndarray | None = None
+) -> np.ndarray:
+    """[B, branches]: where several classes of a branch may be the best."""
+    near = near_best(scores, branches, tolerance, rounding)
+    return np.stack([part.sum(axis=1) > 1 for part in np.split(near, np.cumsum(branches)[:-1], axis=1)], axis=1)
 
 
 def decades(differences: np.ndarray) -> tuple[int, ...]:

@@ -18,7 +18,7 @@ from converters.graph.jitter import Jitter
 from converters.graph.nodes import Graph
 from converters.graph.run import run_graph
 from converters.runtimes.registry import RUNTIMES
-from exporter.verify.difference import row_steps
+from exporter.verify.difference import steps
 from exporter.verify.participants import Feeds
 from signatures.sampling import Case
 
@@ -37,9 +37,8 @@ Rolled = Callable[[Run], list[Arrays]]
 class Rounding:
     """What rounding explains of a policy's outputs and inner tensors; ``settled`` gives values as they are compared.
 
-    Everything is per output, element by element (the largest of a row counts for all of it), for the runtime that is
-    asked about. Where the model itself does not run nothing is explained: that it does not is reported as its own
-    failure.
+    Everything is per output, element by element, for the runtime that is asked about. Where the model itself does not
+    run nothing is explained: that it does not is reported as its own failure.
     """
 
     def __init__(self, seed: int, names: Sequence[str], settled: Callable[[Feeds], Arrays]) -> None:
@@ -119,5 +118,5 @@ def _jittered_answers(
 def _largest(exact: np.ndarray, moved: Sequence[np.ndarray]) -> np.ndarray:
     floor = np.zeros(exact.shape)
     for each in moved:
-        floor = np.maximum(floor, row_steps(exact, each))
+        floor = np.maximum(floor, steps(exact, each))
     return FACTOR * floor

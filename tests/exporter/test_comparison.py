@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from msgspec.structs import replace
 
-from exporter.verify.difference import compare, compare_all, floor_log_probs, ties
+from exporter.verify.difference import compare, compare_all, floor_log_probs, near_best, steps, ties
 from exporter.verify.statistics import FALSE_ALARM, chi_square_survival, fit
 from exporter.verify.tolerances import ATOL, RTOL, Tolerance, tolerance_for
 from signatures.roles import Role
@@ -131,6 +131,15 @@ def test_a_choice_is_free_where_rounding_may_turn_it() -> None:
     assert ties(scores, (2,), PLAIN, np.full((1, 2), 6e-4)).tolist() == [[True]]
 
 
+def test_what_rounding_makes_of_one_score_frees_no_other() -> None:
+    """As of a masked class, whose score of -1e8 rounding moves by 24."""
+    scores, moved = floats(1.0, 0.0, -1e8)[None], floats(0, 0, 94)[None]
+    assert ties(scores, (3,), PLAIN, moved).tolist() == [[False]]
+    assert near_best(floats(1.0, 0.9, -50.0)[None], (3,), PLAIN, floats(0, 0.1, 94)[None]).tolist() == [
+        [True, True, True]
+    ]
+
+
 def test_rounding_takes_the_place_of_a_smaller_tolerance() -> None:
     a, b = floats(1, 1), floats(1, 1.5)
     assert not compare(a, b, PLAIN, rounding=np.array([0.6, 0.4])).passed
@@ -156,20 +165,25 @@ def test_scores_that_are_not_finite_decide_nothing() -> None:
     assert ties(scores, (2,), PLAIN).tolist() == [[True], [True], [False]]
 
 
+def test_rounding_moves_each_element_by_itself() -> None:
+    exact, moved = floats(1, -1e8, -np.inf)[None], floats(1.5, -1e8 + 24, -87)[None]
+    assert steps(exact, moved).tolist() == [[0.5, 24, 0]]
+
+
 # ------------------------------------------------------------------ logarithms of next to nothing
 
 
 def test_log_probabilities_that_say_never_are_all_the_same() -> None:
-    """2^-126 of the likeliest class of the branch is the least that float32 has with all digits."""
+    """2^-126 of the likeliest class of the branch, for each class: what float32 has with all digits is more."""
     scores = np.array([[0.0, -1e8, -5.0, -5.0 - 88], [-3.0, -np.inf, -5.0, -80.0]], np.float32)
-    never = math.log(2) * -126
+    never = math.log(2) * -126 + math.log(2)
     expected = np.array([[0, never, -5, -5 + never], [-3, -3 + never, -5, -80]], np.float32)
     np.testing.assert_allclose(floor_log_probs(scores, (2, 2)), expected, rtol=1e-6, strict=True)
 
 
 def test_log_probabilities_that_do_not_fit_the_branches_are_one_branch() -> None:
     scores = np.array([[0.0, -200.0, -1.0]], np.float32)
-    assert floor_log_probs(scores, (2, 2))[0, 1] == pytest.approx(-126 * math.log(2))
+    assert floor_log_probs(scores, (2, 2))[0, 1] == pytest.approx(-126 * math.log(2) + math.log(3))
     assert floor_log_probs(np.zeros((0, 3), np.float32), (3,)).shape == (0, 3)
 
 

@@ -97,7 +97,7 @@ function settled(values, branches) {
     let start = row;
     for (const count of branches) {
       const part = own.subarray(start, (start += count));
-      const floor = Math.fround(Math.max(...part) + UNDERFLOW);
+      const floor = Math.fround(Math.max(...part) + UNDERFLOW + Math.log(count));
       part.forEach((value, i) => (part[i] = Math.max(value, floor)));
     }
   }
