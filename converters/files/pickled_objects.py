@@ -14,14 +14,25 @@ from __future__ import annotations
 
 import io
 import math
-import re
 from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
 import numpy as np
 from msgspec import Struct
 
-from converters.files.unpickle import KEYS, NAMES, OPCODES, SYSTEM, Function, Machine, carry_out, damaged_error, refusal
+from converters.files.unpickle import (
+    KEYS,
+    MULTIARRAY,
+    NAMES,
+    OPCODES,
+    SYSTEM,
+    Function,
+    Machine,
+    PickledDtype,
+    carry_out,
+    damaged_error,
+    refusal,
+)
 
 #: Types of Python that objects are pickled with.
 _PLAIN_TYPES = frozenset(
@@ -33,11 +44,7 @@ _PLAIN_TYPES = frozenset(
 _BUILTINS = frozenset(("builtins", "__builtin__"))
 #: What protocols 0 and 1 make an object of a class with (Lib/copyreg.py).
 _RECONSTRUCTORS = (("copy_reg", "_reconstructor"), ("copyreg", "_reconstructor"))
-_MULTIARRAY = ("numpy.core.multiarray", "numpy._core.multiarray")
 _NUMERIC = ("numpy.core.numeric", "numpy._core.numeric")
-#: What numpy calls a dtype of numbers in a pickle, and how it marks their byte order.
-_DTYPE = re.compile("f[248]|[iu][1248]|b1")
-_ORDERS: dict[str, Literal["<", ">", "="]] = {"<": "<", ">": ">", "|": "=", "=": "="}
 _MAX_AXES = 32
 
 
@@ -78,7 +85,7 @@ def unpickle_objects(
 
     Raises NotAPolicyError for a name that acts on the machine, DamagedFileError for what breaks the rules of pickles.
     """
-    machine = _Objects(storage or _no_storage, names or {}, 4 * len(data) + (1 << 16))
+    machine = _Objects(storage or _no_storage, names or {})
     machine.refused_modules = SYSTEM - _BUILTINS if functions else SYSTEM
     return carry_out(machine, io.BytesIO(data))
 
@@ -90,24 +97,16 @@ def _no_storage(identity: tuple[Any, ...]) -> Any:
 class _Objects(Machine):
     """A machine for which every other class is a name."""
 
-    def __init__(
-        self,
-        storage: Callable[[tuple[Any, ...]], Any],
-        names: Mapping[tuple[str, str], Any],
-        most_copied: int,
-    ) -> None:
+    def __init__(self, storage: Callable[[tuple[Any, ...]], Any], names: Mapping[tuple[str, str], Any]) -> None:
         super().__init__(storage)
-        self._names = {**NAMES, **names}
+        self._names = {**{name: made for name, made in NAMES.items() if name[1] != "scalar"}, **names}
         self.opcodes = _OPCODES
-        self._most_copied = most_copied
         self.refused_modules = SYSTEM
 
     def import_name(self, module: str, name: str) -> Any:
         """Return what is known of an imported name. Raises NotAPolicyError for one that acts on the machine."""
         if (module, name) in self._names:
             return self._names[module, name]
-        if (module, name) == ("_codecs", "encode"):
-            return Function("encode", self._encode_text)
         root = module.partition(".")[0]
         if root in self.refused_modules and not (root in _BUILTINS and name in _PLAIN_TYPES):
             raise refusal(module, name)
@@ -134,7 +133,7 @@ class _Objects(Machine):
         """Set the state of the object at the top; attributes of a container are left out."""
         state = self.pop()
         target = self.stack[-1]
-        if isinstance(target, Instance):
+        if isinstance(target, Instance | PickledDtype):
             target.state = state
         elif not isinstance(target, dict | list):
             raise damaged_error("its pickle sets the state of something that has none")
@@ -156,16 +155,6 @@ class _Objects(Machine):
             return
         target = self.top(dict)
         target.update({k: v for k, v in zip(items[::2], items[1::2], strict=True) if isinstance(k, KEYS)})
-
-    def _encode_text(self, arguments: tuple[Any, ...]) -> bytes:
-        """Return ``_codecs.encode(text, "latin1")``, with which older protocols write bytes."""
-        text, *coding = arguments
-        if not isinstance(text, str) or coding not in (["latin1"], ["latin-1"]):
-            raise damaged_error("its pickle encodes something that is not bytes")
-        self._most_copied -= len(text)
-        if self._most_copied < 0:
-            raise damaged_error("its pickle repeats its bytes")
-        return text.encode("latin1")
 
 
 _OPCODES = {
@@ -195,34 +184,22 @@ def array_of(value: Any, what: str) -> np.ndarray:
         return np.array(value, np.float64)
     if isinstance(value, Instance):
         module, name = value.maker.module, value.maker.name
-        if module in _MULTIARRAY and name == "_reconstruct" and isinstance(value.state, tuple):
+        if module in MULTIARRAY and name == "_reconstruct" and isinstance(value.state, tuple):
             shape, dtype, fortran, data = value.state[-4:] if len(value.state) >= 4 else (None,) * 4
             return _array(shape, dtype, data, "F" if fortran is True else "C", what)
         if module in _NUMERIC and name == "_frombuffer" and len(value.arguments) == 4:
             data, dtype, shape, order = value.arguments
             return _array(shape, dtype, data, "F" if order == "F" else "C", what)
-        if module in _MULTIARRAY and name == "scalar" and len(value.arguments) == 2:
+        if module in MULTIARRAY and name == "scalar" and len(value.arguments) == 2:
             return _array((), value.arguments[0], value.arguments[1], "C", what)
     raise damaged_error(f"its {what} is not an array of numbers")
 
 
 def _array(shape: Any, dtype: Any, data: Any, order: Literal["C", "F"], what: str) -> np.ndarray:
-    kind = _dtype(dtype)
+    kind = dtype.numbers() if isinstance(dtype, PickledDtype) else None
     whole = isinstance(shape, tuple) and all(isinstance(n, int) and not isinstance(n, bool) and n >= 0 for n in shape)
     if kind is None or not whole or len(shape) > _MAX_AXES or not isinstance(data, bytes):
         raise damaged_error(f"its {what} is not an array of numbers")
     if math.prod(shape) * kind.itemsize != len(data):
         raise damaged_error(f"its {what} has {len(data)} bytes, and its shape {list(shape)[:8]} needs others")
     return np.frombuffer(data, kind).reshape(shape, order=order).astype(kind.newbyteorder("="), copy=False)
-
-
-def _dtype(value: Any) -> np.dtype[Any] | None:
-    """Return the dtype of numbers that was pickled; None where it is another."""
-    if not isinstance(value, Instance) or (value.maker.module, value.maker.name) != ("numpy", "dtype"):
-        return None
-    code = value.arguments[0] if value.arguments else None
-    state = value.state
-    order = state[1] if isinstance(state, tuple) and len(state) > 1 else "="
-    if not isinstance(code, str) or not _DTYPE.fullmatch(code) or not isinstance(order, str) or order not in _ORDERS:
-        return None
-    return np.dtype(code).newbyteorder(_ORDERS[order])

@@ -1,4 +1,4 @@
-"""Pickles as data: a machine that knows plain containers and PyTorch's tensors, and calls nothing.
+"""Pickles as data: a machine that knows plain containers, PyTorch's tensors and numpy's scalars, and calls nothing.
 
 A pickle is a program that may import and call anything, so the standard library's machine is not used: opcodes are
 taken apart by ``pickletools.genops`` (which runs nothing) and carried out here. ``pickle.Unpickler`` with inert stubs
@@ -11,10 +11,12 @@ name. Opcodes: CPython Lib/pickletools.py; what torch.save writes: torch/seriali
 from __future__ import annotations
 
 import pickletools
+import re
 import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import IO, Any
+from typing import IO, Any, Literal
 
+import numpy as np
 from msgspec import Struct
 
 from signatures.errors import DamagedFileError, NotAPolicyError
@@ -53,6 +55,26 @@ class Function(Struct, frozen=True):
     name: str
     make: Callable[[tuple[Any, ...]], Any]
 
+
+class PickledDtype(Struct):
+    """A numpy dtype as it is pickled: its code, and the state that says its byte order."""
+
+    code: Any
+    state: Any = None
+
+    def numbers(self) -> np.dtype[Any] | None:
+        """Return the dtype where it is of plain numbers; else None."""
+        order = self.state[1] if isinstance(self.state, tuple) and len(self.state) > 1 else "="
+        if not isinstance(self.code, str) or not _PLAIN_DTYPE.fullmatch(self.code) or order not in _ORDERS:
+            return None
+        return np.dtype(self.code).newbyteorder(_ORDERS[order])
+
+
+#: What numpy calls a dtype of numbers in a pickle, and how it marks their byte order.
+_PLAIN_DTYPE = re.compile("f[248]|[iu][1248]|b1")
+_ORDERS: Mapping[Any, Literal["<", ">", "="]] = {"<": "<", ">": ">", "|": "=", "=": "="}
+#: Where numpy keeps what makes arrays and scalars, before numpy 2 and since.
+MULTIARRAY = ("numpy.core.multiarray", "numpy._core.multiarray")
 
 _STORAGES = {
     "Float": "float32",
@@ -186,8 +208,11 @@ class Machine:
 
     def build(self) -> None:
         """Attributes of a container: a state dictionary's ``_metadata``, which only PyTorch's loader looks at."""
-        self.pop()
-        self.top(dict)
+        state = self.pop()
+        if isinstance(self.stack[-1], PickledDtype):
+            self.stack[-1].state = state
+        else:
+            self.top(dict)
 
     def persistent(self) -> Any:
         """What a persistent id stands for."""
@@ -260,6 +285,30 @@ def _tensor(arguments: tuple[Any, ...]) -> Tensor:
     return Tensor(storage, offset, shape, strides)
 
 
+def _encode(arguments: tuple[Any, ...]) -> bytes:
+    """Return ``_codecs.encode(text, "latin1")``, with which older protocols write bytes."""
+    text, *coding = arguments
+    if not isinstance(text, str) or coding not in (["latin1"], ["latin-1"]):
+        raise damaged_error("its pickle encodes something that is not bytes")
+    return text.encode("latin1")
+
+
+def _dtype(arguments: tuple[Any, ...]) -> PickledDtype:
+    return PickledDtype(arguments[0] if arguments else None)
+
+
+def _scalar(arguments: tuple[Any, ...]) -> bool | int | float:
+    """``scalar(dtype, bytes)``: a number of numpy's, as training keeps of its returns."""
+    dtype, data = arguments
+    numbers = dtype.numbers() if isinstance(dtype, PickledDtype) else None
+    if numbers is None:
+        raise refusal(MULTIARRAY[-1], "scalar")
+    if not isinstance(data, bytes) or len(data) != numbers.itemsize:
+        raise damaged_error("a scalar in its pickle does not have the bytes of its dtype")
+    value: bool | int | float = np.frombuffer(data, numbers)[0].item()
+    return value
+
+
 def _is_count(value: Any) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < MAX_LENGTH
 
@@ -270,6 +319,9 @@ NAMES: dict[tuple[str, str], Any] = {
     ("torch._utils", "_rebuild_tensor_v2"): Function("_rebuild_tensor_v2", _tensor),
     # of its data, requires_grad, backward_hooks: the data
     ("torch._utils", "_rebuild_parameter"): Function("_rebuild_parameter", lambda arguments: arguments[0]),
+    ("_codecs", "encode"): Function("encode", _encode),
+    ("numpy", "dtype"): Function("dtype", _dtype),
+    **{(module, "scalar"): Function("scalar", _scalar) for module in MULTIARRAY},
     ("torch", "Size"): Function("Size", lambda arguments: tuple(arguments[0])),
     **{("torch", f"{kind}Storage"): StorageType(dtype) for kind, dtype in _STORAGES.items()},
     **{("torch.cuda", f"{kind}Storage"): StorageType(dtype) for kind, dtype in _STORAGES.items()},

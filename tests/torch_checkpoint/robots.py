@@ -10,7 +10,7 @@ import yaml
 
 from fixtures.robots import FOLDER
 from fixtures.torch_checkpoint.cases import waves
-from tests.torch_checkpoint.pt_files import Writer
+from tests.torch_checkpoint.pt_files import RETURNS, Writer
 
 
 def states(name: str) -> dict[str, dict[str, np.ndarray]]:
@@ -44,7 +44,8 @@ def checkpoint(
     writer = Writer()
     path = folder / place
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(writer.zip({**{k: writer.state(s) for k, s in states(name).items()}, "epoch": 3, "frame": 9}))
+    beside = {"epoch": 3, "frame": 9, "last_mean_rewards": RETURNS}
+    path.write_bytes(writer.zip({**{k: writer.state(s) for k, s in states(name).items()}, **beside}))
     if settings:
         (folder / settings).parent.mkdir(parents=True, exist_ok=True)
         data = (FOLDER / f"{name}.yaml").read_bytes()

@@ -19,7 +19,7 @@ from fixtures.torch_checkpoint.cases import waves
 from signatures.errors import NotAPolicyError, SourceError, UsageError
 from signatures.roles import Role
 from tests.commands import export_model
-from tests.torch_checkpoint.pt_files import Writer
+from tests.torch_checkpoint.pt_files import RETURNS, Writer
 
 ACTIVATIONS = {
     **dict.fromkeys(("rsl_2_3", "rsl_5_5", "rsl_5_5_gru"), "elu"),
@@ -48,7 +48,7 @@ def saved(folder: Path, name: str, **changed: Any) -> Path:
     writer = Writer()
     states = {key: writer.state({**state, **changed}) for key, state in tensors(name).items()}
     path = folder / f"{name}.pt"
-    path.write_bytes(writer.zip(states.get("", {**states, "iter": 7, "infos": None})))
+    path.write_bytes(writer.zip(states.get("", {**states, "iter": 7, "infos": RETURNS})))
     return path
 
 
