@@ -180,16 +180,6 @@ def test_vectors_without_a_normaliser_are_one_input_and_a_note_says_so() -> None
     assert any("how many vector sensors the 5 numbers come from" in note for note in signature.notes)
 
 
-def test_vectors_are_split_as_the_user_says() -> None:
-    case = next(c for c in CASES if c.name == "sac_1_1")
-    whole, split = compiled(FOLDER / "sac_1_1.pt"), compiled(FOLDER / "sac_1_1.pt", ((2,), (3,)))
-    assert [s.shape for s in split.signature.inputs if s.role is Role.VECTOR] == [(None, 2), (None, 3)]
-    given = feeds(case, whole)
-    parts = {**given, "state": given["state"][:, :2], "state_1": given["state"][:, 2:]}
-    wanted = run_graph(whole.graph, given, ["action"])["action"]
-    assert run_graph(split.graph, parts, ["action"])["action"] == pytest.approx(wanted, abs=1e-7)
-
-
 # ------------------------------------------------------------------ images, lists of entities, goals
 
 

@@ -9,7 +9,7 @@ before 0.30. What the weights say of a generation:
 0.23     ``action_model.*``, the same lists
 0.24     ``processors``, one list in the order of the sensors; attention over lists of entities
 0.25     the list in an ``observation_encoder``, and again beside it
-0.26     ``version_number`` 3, ``_body_endoder`` in place of ``linear_encoder``; the same up to 1.1
+0.26     ``_body_endoder`` in place of ``linear_encoder``, ``version_number`` 3; the same up to 1.1
 ======== ============================================================================================
 
 What they do not say is fixed: the activation (Swish), the clip of a continuous action (±3, divided by 3) for PPO and
@@ -87,7 +87,9 @@ class _Generation(Struct, frozen=True):
 def _generation(state: State) -> _Generation:
     """What wrote the checkpoint. Raises SourceError for what is not read, by its name."""
     version = int(np.clip(np.nan_to_num(state.number(VERSION_NUMBER)), 0, 99))
-    body = f"{_BODY}._body_endoder" if state.under(f"{_BODY}._body_endoder.") else f"{_BODY}.linear_encoder"
+    body = f"{_BODY}.linear_encoder"
+    if state.under(f"{_BODY}._body_endoder."):  # a parameter like the number may have been trained, or drawn
+        version, body = max(version, TORCH_VERSION_3), f"{_BODY}._body_endoder"
     encoder = f"{_BODY}.observation_encoder" if state.under(f"{_BODY}.observation_encoder.rsa.") else _BODY
     preview = state.step_is_float
     if state.under("distribution."):
@@ -124,7 +126,7 @@ def to_graph(state: State, told: Sequence[tuple[int, ...]], goals: Sequence[int]
     sensors, joined = find_sensors(state, generation.lists, generation.encoder, width, told)
     goals = find_goals(state, sensors, condition, goals, joined=joined)
     net = Network(state)
-    x, goal = _encode_sensors(net, generation, sensors, goals)
+    x, goal = _encode_sensors(net, generation, sensors, goals, told)
     x = hidden_layers(net, x, goal, generation.body)
     memory = None
     if f"{_BODY}.lstm.lstm.weight_hh_l0" in state:
@@ -144,7 +146,7 @@ def to_graph(state: State, told: Sequence[tuple[int, ...]], goals: Sequence[int]
         image_layout="NCHW",
         memory_layout=() if memory is None else ("h", "c"),
         outputs=dict.fromkeys((VERSION_NUMBER, MEMORY_SIZE, *names)),
-        notes=tuple(_notes(generation, sensors, joined, squashed=conditional is True, guessed=trainer is None)),
+        notes=tuple(_notes(generation, sensors, joined, squashed=conditional, guessed=trainer is None)),
         decisions=_reasons(generation, sensors),
     )
     return net.graph(), facts
@@ -171,18 +173,20 @@ def _trainer(state: State, conditional: bool | None) -> str | None:
 
 
 def _notes(
-    generation: _Generation, sensors: Sequence[Sensor], joined: bool, *, squashed: bool, guessed: bool
+    generation: _Generation, sensors: Sequence[Sensor], joined: bool, *, squashed: bool | None, guessed: bool
 ) -> list[str]:
     notes = [pytorch_alone("ML-Agents", "a checkpoint")]
     if squashed and generation.by_sensor:
         notes.append(SAC_MEAN)
-    if squashed and guessed:
-        notes.append("its deviation depends on the observation, as SAC's alone does: tanh is taken to bound its action")
-    if joined and generation.by_sensor:
-        size = next(s.shape[0] for s in sensors if len(s.shape) == 1)
+    if squashed is not None and guessed:
+        whose, bound = ("depends", "SAC's alone does: tanh") if squashed else ("does not depend", "PPO's: a clip")
+        notes.append(f"its deviation {whose} on the observation, as {bound} is taken to bound its action")
+    vectors = [s for s in sensors if len(s.shape) == 1 and not s.places]
+    if vectors and (joined or (not generation.by_sensor and (len(vectors) > 1 or len(generation.lists) > 1))):
+        size = sum(s.shape[0] for s in vectors)
         notes.append(
             f"the checkpoint does not tell how many vector sensors the {size} numbers come from; they are one input, "
-            "in the order of the sensors"
+            "in the order of the sensors; --sensors, a shape for each, gives each an input of its own"
         )
     return notes
 
@@ -199,6 +203,9 @@ def _input_names(generation: _Generation, sensors: Sequence[Sensor]) -> list[str
     """What the generation calls the input of each sensor."""
     names, images = list[str](), 0
     for index, sensor in enumerate(sensors):
+        if sensor.places:
+            names.append(f"obs_{sensor.places[0]}")
+            continue
         image = len(sensor.shape) == 3
         by_number = generation.by_sensor or len(sensor.shape) == 2
         names.append(f"obs_{index}" if by_number else f"visual_observation_{images}" if image else _JOINED)
@@ -208,17 +215,23 @@ def _input_names(generation: _Generation, sensors: Sequence[Sensor]) -> list[str
 
 def _reasons(generation: _Generation, sensors: Sequence[Sensor]) -> dict[str, Decision]:
     """Input → why it is an observation, and what of."""
-    pairs = zip(_input_names(generation, sensors), sensors, strict=True)
+    pairs = [(f"obs_{place}", s) for s in sensors for place in s.places]
+    pairs = pairs or list(zip(_input_names(generation, sensors), sensors, strict=True))
     return {name: Decision(name, _SENSOR_ROLES.get(len(s.shape), Role.VECTOR), s.says) for name, s in pairs}
 
 
 def _encode_sensors(
-    net: Network, generation: _Generation, sensors: Sequence[Sensor], goals: Sequence[int]
+    net: Network,
+    generation: _Generation,
+    sensors: Sequence[Sensor],
+    goals: Sequence[int],
+    told: Sequence[tuple[int, ...]],
 ) -> tuple[str, str | None]:
     """All sensors, encoded and joined: what the first layer reads; and the goals alone, where there are some."""
     vectors = [s for s in sensors if len(s.shape) == 1]
+    inputs = [net.input(f"obs_{place}", *shape) for place, shape in enumerate(told)]
     shared = None
-    if vectors and not generation.by_sensor:
+    if vectors and not generation.by_sensor and not told:
         shared = net.input(_JOINED, sum(s.shape[0] for s in vectors))
     parts: dict[int, str] = {}
     entities: list[tuple[str, str]] = []
@@ -227,9 +240,11 @@ def _encode_sensors(
         image = len(sensor.shape) == 3
         if len(sensor.shape) == 2:
             assert sensor.module is not None
-            entities.append((sensor.module, net.input(name, *sensor.shape)))
+            entities.append((sensor.module, inputs[index] if told else net.input(name, *sensor.shape)))
             continue
-        if generation.by_sensor or image:
+        if sensor.places:
+            x = net.concat([inputs[place] for place in sensor.places], 1)
+        elif generation.by_sensor or image:
             x = net.input(name, *sensor.shape)
         else:
             assert shared is not None

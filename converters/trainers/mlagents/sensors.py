@@ -28,12 +28,14 @@ class Sensor(Struct, frozen=True):
     """One input of the network.
 
     ``shape`` has lists of entities as [most, numbers], images as C, H, W; ``module`` is None where the numbers go in as
-    they are; ``says`` is why it is a sensor.
+    they are; ``says`` is why it is a sensor. ``places`` are those of the agent's sensors that it joins, as the user
+    says; empty where nobody does.
     """
 
     shape: tuple[int, ...]
     module: str | None
     says: str = "--sensors says so"
+    places: tuple[int, ...] = ()
 
 
 class Encoder(Struct, frozen=True):
@@ -345,9 +347,11 @@ def _from_user(
     told: Sequence[tuple[int, ...]],
 ) -> list[Sensor]:
     """The sensors that the user names, checked against the weights. Raises UsageError."""
-    if len(lists) > 1:  # 0.22, 0.23: all vectors joined before the images
-        vectors = sum(s[0] for s in told if len(s) == 1)
-        told = [*([(vectors,)] if vectors else []), *(s for s in told if len(s) == 3)]
+    places: list[tuple[int, ...]] = [(i,) for i in range(len(told))]
+    if len(lists) > 1:  # 0.20 to 0.23: all vectors joined before the images
+        vectors = tuple(i for i, s in enumerate(told) if len(s) == 1)
+        places = [*([vectors] if vectors else []), *((i,) for i, s in enumerate(told) if len(s) == 3)]
+        told = [told[p[0]] if len(p) == 1 else (sum(told[i][0] for i in p),) for p in places]
         normalised = any(m is not None and encoder_of(state, m) is None for m in modules)
         modules = [*([None] if vectors and not normalised else []), *modules]
     given = [*modules, *[None] * (len(told) - len(modules))]
@@ -364,7 +368,7 @@ def _from_user(
             columns += _columns_as_told(state, number, module, shape, told)
     if columns != width:
         raise _contradiction(told, f"its first layer takes {width} columns, and these sensors give {columns}")
-    return [Sensor(tuple(shape), module) for shape, module in zip(told, given, strict=True)]
+    return [Sensor(tuple(s), module, places=p) for s, module, p in zip(told, given, places, strict=True)]
 
 
 def _columns_as_told(
