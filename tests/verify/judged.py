@@ -1,0 +1,105 @@
+"""Verification of small policies with no process: the kernels of the numpy child, and a runtime that goes wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from converters.compiler.compile import compile_graph
+from converters.compiler.options import CompileOptions
+from converters.formats.frozen_graph.reader import read_graph
+from converters.policy.policy import Policy
+from converters.runtimes.numpy import child
+from converters.runtimes.registry import RuntimeInfo
+from exporter.verify.options import VerifyOptions
+from exporter.verify.participants import Feeds, Participant, policy_under_test
+from exporter.verify.report import ParityReport
+from exporter.verify.session import Session
+from exporter.verify.verification import CHECKS, Check, verify
+from tests.handmade import graph_bytes
+
+Arrays = dict[str, npt.NDArray[Any]]
+#: What a runtime is fed and what it answers → what it says instead.
+Spoil = Callable[[Feeds, Arrays], Arrays]
+KNOWN = tuple(RuntimeInfo(name, True, "1.0", "") for name in ("numpy", "onnxruntime"))
+
+
+class Model:
+    """A model of the numpy child, in this process."""
+
+    def __init__(self, path: str, **options: Any) -> None:
+        self._model = child._load({"path": path, **options})
+
+    def run(self, feeds: Feeds, fetch: Sequence[str], **request: Any) -> Arrays:
+        return dict(self._model.run(dict(feeds), list(fetch), request))
+
+    def run_all(
+        self, inputs: Sequence[Feeds], fetch: Sequence[str], requests: Sequence[Mapping[str, Any]] = ()
+    ) -> list[Arrays]:
+        more = requests or [{}] * len(inputs)
+        return [self.run(feeds, fetch, **request) for feeds, request in zip(inputs, more, strict=True)]
+
+    def unload(self) -> None:
+        pass
+
+
+class Pool:
+    """Takes the part of a RuntimePool."""
+
+    def start(self, names: object) -> None:
+        pass
+
+    def process(self, name: str) -> SimpleNamespace:
+        return SimpleNamespace(load=Model)
+
+    def versions(self) -> dict[str, str]:
+        return {"numpy": "1", "onnxruntime": "1"}
+
+
+def compiled(nodes: Sequence[Any], options: CompileOptions | None = None) -> Policy:
+    """The policy of a frozen graph made by hand."""
+    (policy,) = compile_graph(read_graph(graph_bytes(nodes)), "policy", options)
+    return policy
+
+
+def judge(
+    policy: Policy,
+    folder: Path,
+    spoil: Spoil = lambda feeds, answers: answers,
+    *,
+    checks: Sequence[Check] = CHECKS,
+    options: VerifyOptions | None = None,
+    inputs: Any = None,
+    runtime: str = "onnxruntime",
+) -> ParityReport:
+    """The report on a runtime that says ``spoil`` of what the kernels answer."""
+    tested = policy_under_test(policy, {}, folder, sizes={})
+
+    def participants(numpy: Any, failed: object) -> Iterator[Participant]:
+        def run(given: Sequence[Feeds], fetch: Sequence[str]) -> list[Arrays]:
+            return [spoil(feeds, numpy.run(feeds, fetch)) for feeds in given]
+
+        outputs = [s.name for s in policy.signature.outputs]
+        yield Participant(format="onnx", runtime=runtime, run=run, outputs=outputs, model=numpy)
+
+    session = Session(("numpy", runtime), KNOWN, Pool(), options or VerifyOptions())  # type: ignore[arg-type]
+    return verify(tested, session, participants, inputs, checks)
+
+
+def wrong(report: ParityReport) -> set[tuple[str, str]]:
+    """(kind, output) of what failed."""
+    return {(f.kind, f.output) for f in report.failures}
+
+
+def spoiling(output: str, how: Callable[[Feeds, npt.NDArray[Any]], npt.NDArray[Any]]) -> Spoil:
+    """One output is what ``how`` makes of the inputs and of itself."""
+
+    def spoil(feeds: Feeds, answers: Arrays) -> Arrays:
+        return {n: np.asarray(how(feeds, a)) if n == output else a for n, a in answers.items()}
+
+    return spoil
