@@ -1,8 +1,9 @@
 """A change between channels first and channels last, written as a Reshape, as the Transpose that it is.
 
-An image of one channel has the same numbers in both layouts, so that its Transpose became a Reshape (``simplify``).
-A convolution behind it, which is computed channels first, then cannot cancel it, and Barracuda 1.3 lays the input out
-wrongly (../shared/unity/r3/cases/gray_camera_barracuda-1.0: 11 of 11 right without the pair).
+An image of one channel, or of one pixel, has the same numbers in both layouts, so that its Transpose became a Reshape
+(``simplify``). A convolution beside it, which is computed channels first, then cannot cancel it. Barracuda 1.3 lays the
+input out wrongly (../shared/unity/r3/cases/gray_camera_barracuda-1.0: 11 of 11 right without the pair), 3.0.0 takes the
+whole file for channels last (../shared/unity/r4, ``cam_buffer``, whose last convolution leaves one pixel).
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ _TO_LAST, _TO_FIRST = (0, 2, 3, 1), (0, 3, 1, 2)
 
 
 def transpose_layout_views(graph: Graph, roots: Collection[str] = ()) -> Graph:
-    """Return the graph with a Transpose for each Reshape that moves a channel axis of length 1."""
+    """Return the graph with a Transpose for each Reshape that moves axes of length 1 alone."""
     types = infer_types(graph)
     editor = Editor(graph)
     for node in graph.nodes:
@@ -31,10 +32,12 @@ def transpose_layout_views(graph: Graph, roots: Collection[str] = ()) -> Graph:
 
 
 def _order(before: tuple[Dim, ...] | None, after: tuple[Dim, ...] | None) -> tuple[int, ...] | None:
-    """The order of axes by which an image of one channel [B, 1, H, W] or [B, H, W, 1] became the other."""
+    """The order of axes by which an image of one channel, or of one pixel, became the same in the other layout."""
     if before is None or after is None or len(before) != 4 or len(after) != 4:
         return None
     for order, channel in ((_TO_LAST, 1), (_TO_FIRST, 3)):
-        if before[channel] == 1 and after == tuple(before[axis] for axis in order) != before:
+        pixels = [before[axis] for axis in (1, 2, 3) if axis != channel]
+        same = before[channel] == 1 or pixels == [1, 1]
+        if same and after == tuple(before[axis] for axis in order) != before:
             return order
     return None

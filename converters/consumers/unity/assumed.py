@@ -30,7 +30,8 @@ def assumed_brain(model: CheckedModel, ranks: Sequence[int]) -> Brain:
     for position, (view, rank) in enumerate(zip(model.inputs, ranks, strict=True)):
         if view.name in _NOT_SENSED or not 2 <= rank <= 4:
             continue
-        shapes = {2: (view.channels,), 3: (view.channels, view.width), 4: _picture(view)}
+        entities = (view.width, view.channels) if view.kept else (view.channels, view.width)
+        shapes = {2: (view.channels,), 3: entities, 4: _picture(view)}
         numbered = _NUMBERED.fullmatch(view.name)
         vector = view.channels if view.name == VECTOR else vector
         order = (0, int(numbered[1])) if numbered else (2 if view.name == VECTOR else 1, position)

@@ -1,19 +1,20 @@
 """What Barracuda 3.0.0 holds after importing an ONNX or loading a ``.nn``: shapes in N, H, W, C, everything float.
 
-An ONNX input of rank 2, 3, 4 is [N,C], [N,C,W], [N,C,H,W]; a free length is 0. One of rank 4 is kept as [N,H,W,C] where
-the file brings it to NCHW itself, by a Transpose (or a Reshape of one channel) that a Conv reads. The state of an
-LSTM becomes a memory that the runtime manages; where it is cut from an input directly, that input is gone.
+An ONNX input of rank 2, 3, 4 is [N,C], [N,C,W], [N,C,H,W]; a free length is 0. It is kept as [N,W,C], [N,H,W,C] where
+the importer takes it for channels last (``channel_order``). The state of an LSTM becomes a memory that the runtime
+manages; where it is cut from an input directly, that input is gone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
 from msgspec import Struct, field
 
 from converters.consumers.mlagents.names import ACTION, CONTINUOUS, DISCRETE
+from converters.consumers.unity.channel_order import keeps_last
 from converters.consumers.unity.consumers import Consumer
 from converters.consumers.unity.findings import Thrown, UnityThrows, null_reference
 from converters.consumers.unity.model import CheckedModel, InputView, truncate
@@ -105,8 +106,8 @@ class EarlierModel(BarracudaModel, frozen=True):
 def of_onnx(file: OnnxFile, consumer: Consumer) -> BarracudaModel:
     """The model that the ONNX importer makes; ``importing.refusal`` has said before that it takes the file."""
     memories, taken = _memories(file)
-    kept = _keeps_all_nhwc(file) if not consumer.reads_version else None
-    inputs = [_input(file, i.name, i.dims or (), kept) for i in file.inputs if i.name not in taken]
+    kept = _kept_inputs(file, consumer)
+    inputs = [_input(i.name, i.dims or (), i.name in kept) for i in file.inputs if i.name not in taken]
     found = {name: file.value(name) for name in file.outputs}
     constants = {trim_index(n): v.astype(np.float64).ravel() for n, v in found.items() if v is not None}
     outputs = tuple(trim_index(n) for n in file.outputs)
@@ -139,29 +140,23 @@ def trim_index(name: str) -> str:
     return name.removesuffix(":0")
 
 
-def _input(file: OnnxFile, name: str, dims: Dims, keeps_nhwc: bool | None) -> InputView:
-    """``keeps_nhwc`` is what the importer decides for all inputs at once, None where it looks at each."""
+def _kept_inputs(file: OnnxFile, consumer: Consumer) -> Collection[str]:
+    """The inputs that are kept as they are declared, channels last."""
+    if consumer.reads_version:
+        return keeps_last(file) or ()
+    return [i.name for i in file.inputs if len(i.dims or ()) == 4] if _keeps_all_nhwc(file) else ()
+
+
+def _input(name: str, dims: Dims, keeps_nhwc: bool) -> InputView:
     lengths = [d or 0 for d in dims]
     height = width = channels = 1
-    if len(lengths) == 4 and (_kept_nhwc(file, name) if keeps_nhwc is None else keeps_nhwc):
-        height, width, channels = lengths[1:]
+    if keeps_nhwc and 2 <= len(lengths) <= 4:
+        height, width, channels = (*(1,) * (4 - len(lengths)), *lengths[1:])
     elif len(lengths) >= 2:
         channels = lengths[1]
         width = lengths[-1] if len(lengths) > 2 else 1
         height = lengths[-2] if len(lengths) > 3 else 1
-    return InputView(trim_index(name), height, width, channels, channels)
-
-
-def _kept_nhwc(file: OnnxFile, name: str) -> bool:
-    for node in file.readers(name):
-        made = node.output[0] if node.output else ""
-        if any(reader.op_type == "Conv" and reader.input[:1] == [made] for reader in file.readers(made)):
-            perm = attributes(node).get("perm")
-            if node.op_type == "Transpose" and perm is not None and tuple(perm.ints) == _TO_NCHW:
-                return True
-            if node.op_type == "Reshape" and _moves_one_channel(file, name, made):
-                return True
-    return False
+    return InputView(trim_index(name), height, width, channels, channels, keeps_nhwc)
 
 
 def _keeps_all_nhwc(file: OnnxFile) -> bool:
@@ -181,14 +176,6 @@ def _keeps_all_nhwc(file: OnnxFile) -> bool:
         if source in declared and any(r.op_type == "Conv" and r.input[0] == node.output[0] for r in readers):
             return True
     return False
-
-
-def _moves_one_channel(file: OnnxFile, name: str, made: str) -> bool:
-    """[N,H,W,1] to [N,1,H,W], which moves no number."""
-    before, after = file.shapes.get(name), file.shapes.get(made)
-    if before is None or after is None or len(before) != 4 or len(after) != 4:
-        return False
-    return before[3] == after[1] == 1 and before[1:3] == after[2:]
 
 
 def _memories(file: OnnxFile) -> tuple[tuple[str, ...], set[str]]:

@@ -61,9 +61,19 @@ def _last_place(port: Port) -> int:
     return ((height - 1) * port.view.width + width - 1) * port.view.channels + channels - 1
 
 
-def reads_entities_transposed(port: Port, scene: Scene) -> bool:
-    """Whether a list of entities is read in the order that the file declares, not in that of what is written."""
-    return len(port.sensor) == 2 and min(port.sensor) > 1 and not reads_flat(port.name, scene.file, scene.nn)
+def misreads_entities(port: Port, scene: Scene) -> bool:
+    """Whether a list of entities is read in another order than the one in which it is written."""
+    if len(port.sensor) != 2 or min(port.sensor) < 2:
+        return False
+    return _keeps_entities(port) or not reads_flat(port.name, scene.file, scene.nn)
+
+
+def _keeps_entities(port: Port) -> bool:
+    return port.view is not None and port.view.kept
+
+
+_TURNED = "transposed, and ML-Agents writes it flat: the model sees the observation transposed"
+_KEPT = "channels last, as the pictures: the agent is asked for another sensor, and the model throws or acts otherwise"
 
 
 def action_width(port: Port, scene: Scene) -> int:
@@ -104,6 +114,7 @@ def fields(port: Port, scene: Scene) -> Mapping[str, object]:
         "sensor": "x".join(map(str, port.sensor)),
         "sensor_lengths": ", ".join(map(str, port.sensor)),
         "declare": f"[{', '.join(map(str, ('N', *port.sensor)))}]",
+        "entities": _KEPT if _keeps_entities(port) else _TURNED,
         "axes": len(port.sensor) + 1,
         "wanted": sensor_size(port) if port.sensor else _columns(port, scene),
         "batch": free,

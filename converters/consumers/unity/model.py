@@ -24,7 +24,8 @@ _MOST_NEGATIVE = -(1 << 31)
 class InputView(Struct, frozen=True):
     """An input as the checker reads it: lengths by Unity's names for axes, 0 or 1 for those the file leaves free.
 
-    ``last`` is the length of the last axis as the runtime orders them.
+    ``last`` is the length of the last axis as the runtime orders them; ``kept``: it orders them as the file does,
+    channels last.
     """
 
     name: str
@@ -32,6 +33,7 @@ class InputView(Struct, frozen=True):
     width: int
     channels: int
     last: int
+    kept: bool = False
 
 
 class CheckedModel:

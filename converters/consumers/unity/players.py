@@ -332,13 +332,12 @@ _BARRACUDA_OBSERVATIONS = (
     ),
     Row(
         of=(OBSERVATION,),
-        form="entities read as the file declares them: [N, E, F]",
+        form="entities read as the file declares them, [N, E, F], or of a file whose pictures are channels last",
         outcome=Outcome.WRONG,
-        when=forms.reads_entities_transposed,
-        says="{name} is {shape}, which Barracuda lays out transposed, and ML-Agents writes it flat: the model sees the "
-        "observation transposed",
+        when=forms.misreads_entities,
+        says="{name} is {shape}, which Barracuda lays out {entities}",
         fix="put Transpose (0, 2, 1) and Reshape [-1, {sensor_lengths}] right behind the input; --for {profile} does",
-        evidence="rank2_flat, rank2_per_entity, rank2_mul",
+        evidence="rank2_flat, rank2_per_entity, rank2_mul; cam_buffer of r4",
     ),
 )
 _BARRACUDA_MASKS = (
