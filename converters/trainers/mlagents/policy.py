@@ -203,9 +203,6 @@ def _input_names(generation: _Generation, sensors: Sequence[Sensor]) -> list[str
     """What the generation calls the input of each sensor."""
     names, images = list[str](), 0
     for index, sensor in enumerate(sensors):
-        if sensor.places:
-            names.append(f"obs_{sensor.places[0]}")
-            continue
         image = len(sensor.shape) == 3
         by_number = generation.by_sensor or len(sensor.shape) == 2
         names.append(f"obs_{index}" if by_number else f"visual_observation_{images}" if image else _JOINED)
@@ -220,6 +217,28 @@ def _reasons(generation: _Generation, sensors: Sequence[Sensor]) -> dict[str, De
     return {name: Decision(name, _SENSOR_ROLES.get(len(s.shape), Role.VECTOR), s.says) for name, s in pairs}
 
 
+def _sensor_inputs(
+    net: Network, generation: _Generation, sensors: Sequence[Sensor], told: Sequence[tuple[int, ...]]
+) -> list[str]:
+    """The numbers of each sensor: an input of its own, a slice of one for all vectors, or inputs joined."""
+    if told:
+        inputs = [net.input(f"obs_{place}", *shape) for place, shape in enumerate(told)]
+        net.at(_BODY)
+        return [net.concat([inputs[place] for place in sensor.places], 1) for sensor in sensors]
+    widths = [s.shape[0] for s in sensors if len(s.shape) == 1]
+    shared = net.input(_JOINED, sum(widths)) if widths and not generation.by_sensor else None
+    found, start = list[str](), 0
+    for sensor, name in zip(sensors, _input_names(generation, sensors), strict=True):
+        if shared is None or len(sensor.shape) > 1:
+            found.append(net.input(name, *sensor.shape))
+            continue
+        net.at(sensor.module or _BODY)
+        end = start + sensor.shape[0]
+        found.append(shared if len(widths) == 1 else net.slice(shared, 1, start, end))
+        start = end
+    return found
+
+
 def _encode_sensors(
     net: Network,
     generation: _Generation,
@@ -228,34 +247,16 @@ def _encode_sensors(
     told: Sequence[tuple[int, ...]],
 ) -> tuple[str, str | None]:
     """All sensors, encoded and joined: what the first layer reads; and the goals alone, where there are some."""
-    vectors = [s for s in sensors if len(s.shape) == 1]
-    inputs = [net.input(f"obs_{place}", *shape) for place, shape in enumerate(told)]
-    shared = None
-    if vectors and not generation.by_sensor and not told:
-        shared = net.input(_JOINED, sum(s.shape[0] for s in vectors))
     parts: dict[int, str] = {}
     entities: list[tuple[str, str]] = []
-    start = 0
-    for index, (sensor, name) in enumerate(zip(sensors, _input_names(generation, sensors), strict=True)):
-        image = len(sensor.shape) == 3
+    for index, (sensor, x) in enumerate(zip(sensors, _sensor_inputs(net, generation, sensors, told), strict=True)):
         if len(sensor.shape) == 2:
             assert sensor.module is not None
-            entities.append((sensor.module, inputs[index] if told else net.input(name, *sensor.shape)))
+            entities.append((sensor.module, x))
             continue
-        if sensor.places:
-            x = net.concat([inputs[place] for place in sensor.places], 1)
-        elif generation.by_sensor or image:
-            x = net.input(name, *sensor.shape)
-        else:
-            assert shared is not None
-            net.at(sensor.module or _BODY)
-            whole = len(vectors) == 1
-            x = shared if whole else net.slice(shared, 1, start, start + sensor.shape[0])
-            start += sensor.shape[0]
-        if image and sensor.module is not None:
-            x = _image(net, x, sensor.module)
-        elif sensor.module is not None:
-            x = net.normalise(x, f"{sensor.module}.normalizer")
+        if sensor.module is not None:
+            image = len(sensor.shape) == 3
+            x = _image(net, x, sensor.module) if image else net.normalise(x, f"{sensor.module}.normalizer")
         parts[index] = x
     net.at(_BODY)
     columns = [net.concat(list(parts.values()), 1)] if parts else []
