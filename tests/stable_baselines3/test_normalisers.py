@@ -79,6 +79,8 @@ def test_pickles_of_other_versions_hold_the_same(file: Path) -> None:
         ("model.zip", "vecnormalize.pkl"),
         ("model.zip", "vec_normalize.pkl"),
         ("model.zip", "model_vecnormalize.pkl"),
+        ("model.zip", "vecnormalize_model.pkl"),
+        ("best_model.zip", "../vecnormalize.pkl"),
         ("model.zip", "model/vecnormalize.pkl"),
         ("rl_model_500_steps.zip", "rl_model_vecnormalize_500_steps.pkl"),
     ],
@@ -88,6 +90,51 @@ def test_the_statistics_are_found_where_the_library_and_its_zoo_put_them(model: 
     path = path.rename(path.parent / model)
     notes = compiled(path).signature.notes
     assert any(Path(file).name in note and "normalised inside" in note for note in notes)
+
+
+@pytest.mark.parametrize(
+    ("files", "taken"),
+    [
+        (("vecnormalize.pkl", "vec_normalize.pkl"), "error"),
+        (("vecnormalize.pkl", "vecnormalize_best.pkl"), "error"),
+        (("VecNormalize_stats.pkl",), "error"),
+        (("../vecnormalize.pkl",), "error"),
+        (("../vec_normalize.pkl", "../vecnormalize.pkl"), "error"),
+        (("vecnormalize.pkl", "../vecnormalize.pkl"), "vecnormalize.pkl"),
+        (("model_vecnormalize.pkl", "vecnormalize.pkl"), "model_vecnormalize.pkl"),
+        (("vecnormalize.pkl", "rl_model_vecnormalize_500_steps.pkl", "other_vecnormalize.pkl"), "vecnormalize.pkl"),
+        (("rl_model_vecnormalize_500_steps.pkl",), None),
+        (("other_vecnormalize.pkl", "../rl_model_vecnormalize_500_steps.pkl"), None),
+    ],
+)
+def test_all_statistics_that_were_seen_are_named_and_none_is_guessed(
+    files: tuple[str, ...], taken: str | None, tmp_path: Path
+) -> None:
+    """Of one or none of them the names say that it is this model's; else the error says what to type."""
+    model = placed("ppo_box", tmp_path / "logs/run", None)
+    shutil.copy(model, model.parent / "other.zip")
+    for number, file in enumerate(files):
+        data = (NORMALISED / "ppo_box.pkl").read_bytes()
+        (model.parent / file).write_bytes(data.replace(b"clip_obs", b"clip_ob" + bytes([115 - number])))
+    paths = [(model.parent / file).resolve() for file in files]
+    if taken == "error":
+        with pytest.raises(SourceError, match="may have been normalised by") as caught:
+            compiled(model)
+        assert all(f"--normaliser {path}" in str(caught.value) for path in paths)
+        assert "--set normaliser=none" in str(caught.value)
+        for said in (str(paths[0]), NO_NORMALISER):
+            assert compiled(model, normaliser=said).signature.notes
+        return
+    notes = "\n".join(compiled(model).signature.notes)
+    assert ("normalised inside" in notes) == (taken is not None)
+    assert all(str(path) in notes for path in paths if path.name != taken or path.parent != model.parent)
+    assert ("--normaliser FILE takes one" in notes) == (len(files) > 1 or taken is None)
+
+
+def test_two_names_of_the_same_statistics_are_one(tmp_path: Path) -> None:
+    model = placed("ppo_box", tmp_path / "run")
+    shutil.copy(model.parent / "vecnormalize.pkl", model.parent / "vec_normalize.pkl")
+    assert any("normalised inside" in note for note in compiled(model).signature.notes)
 
 
 def test_the_best_model_of_a_run_has_the_statistics_of_the_run(tmp_path: Path) -> None:

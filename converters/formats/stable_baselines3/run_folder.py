@@ -8,16 +8,20 @@ Sources: rl_zoo3/exp_manager.py (``<log>/<env>_<n>/<env>.zip``, its settings and
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from converters.files.fetch import Fetched, unreadable
+from converters.files.fetch import Fetched, path_text, unreadable
 from converters.formats.format import Member
 from converters.formats.source import ReadOptions
 from signatures.errors import SourceError
 
 _STATISTICS = ("vecnormalize.pkl", "vec_normalize.pkl")
+#: What people call them, too.
+_LIKE = re.compile(r".*vec_?normali[sz]e.*\.pkl", re.IGNORECASE)
+_OF_A_STEP = re.compile(r"_\d+_steps$")
 _SETTINGS = ("config.yml", "args.yml")
 _UNPACKED = "policy.pth"
 _OF_STEP = re.compile(r"(.+)_(\d{1,18})_steps")
@@ -29,13 +33,49 @@ _NORMALIZE = re.compile(r"^[ -]*normalize(?::|\n[ -]*-) *([^\n]{0,300})", re.MUL
 _NOT_OBSERVATIONS = re.compile(r"norm_obs['\"]{0,3} {0,3}[:=] {0,3}false", re.IGNORECASE)
 
 
-def statistics_beside(model: Path) -> Path | None:
-    """Return the file with the statistics that a model's observations were normalised by, where one lies beside it."""
-    for folder, names in _places(model):
-        for name in names:
-            if (folder / name).is_file():
-                return folder / name
-    return None
+def statistics_beside(given: Fetched, *, wanted: bool = True) -> tuple[Path | None, list[Path]]:
+    """Return the file that a model's observations were normalised by, and all others that were seen.
+
+    A file of the model's own name is its; else the only one beside it that no other model has, under the library's
+    name, or one folder up of a model that a callback saved (``EvalCallback`` has a folder of its own). Raises
+    SourceError where others may be it, unless it is not ``wanted``.
+    """
+    model = given.path
+    beside, above = (_statistics_in(folder) for folder in (model.parent, Path(os.path.normpath(model.parent / ".."))))
+    seen = [*beside, *(file for file in above if file not in beside)]
+    known = (folder / name for folder, names in _places(model) for name in names)
+    own = next((file for file in known if file.is_file()), None)
+    if own is not None and (own.name not in _STATISTICS or own.parent != model.parent):
+        return own, [file for file in seen if file != own]
+    free = [file for file in beside if not _is_anothers(file, model)]
+    callback = model.stem in _OF_CALLBACKS or _OF_STEP.fullmatch(model.stem) is not None
+    able = free or [file for file in above if not _is_anothers(file, model)]
+    if able and able[0].name in _STATISTICS and (free or callback) and len({*map(given.bytes_of, able)}) == 1:
+        return able[0], [file for file in seen if file != able[0]]
+    if not able or not wanted:
+        return None, seen
+    raise SourceError(
+        f"its observations may have been normalised by {' or '.join(file.name for file in able[:8])}",
+        why=f"statistics of VecNormalize lie {'beside it' if free else 'one folder up'}, and their names do not say "
+        "that they are of this model",
+        fix=f"say which: {' or '.join(f'--normaliser {path_text(file)}' for file in able[:8])}; none: "
+        "--set normaliser=none",
+    )
+
+
+def _statistics_in(folder: Path) -> list[Path]:
+    """Return the files of a folder that are called like statistics of VecNormalize."""
+    try:
+        return sorted(p for p in folder.iterdir() if _LIKE.fullmatch(p.name) and p.is_file())
+    except OSError:  # a folder that may be entered and not listed
+        return []
+
+
+def _is_anothers(file: Path, model: Path) -> bool:
+    """Whether a file's name says of which other model it is: of a step, or of one that lies beside it."""
+    stem, others = file.stem.lower(), {p.stem.lower() for p in file.parent.glob("*.zip")} - {model.stem.lower()}
+    named = any(stem.startswith(f"{other}_") or stem.endswith(f"_{other}") for other in others)
+    return named or _OF_A_STEP.search(stem) is not None
 
 
 def settings_that_normalise(given: Fetched) -> Path | None:
@@ -58,7 +98,8 @@ def _places(model: Path) -> Iterator[tuple[Path, list[str]]]:
     if step is not None:
         yield model.parent, [f"{step[1]}_vecnormalize_{step[2]}_steps.pkl"]
     yield model if model.is_dir() else model.parent / stem, [*_STATISTICS]
-    yield model.parent, [*(f"{stem}_{name}" for name in _STATISTICS), *_STATISTICS]
+    own = [called for name in _STATISTICS for called in (f"{stem}_{name}", f"{Path(name).stem}_{stem}.pkl")]
+    yield model.parent, [*own, *_STATISTICS]
     if step is not None or stem in _OF_CALLBACKS:
         runs = _runs(model.parent)
         if len(runs) == 1:

@@ -13,7 +13,7 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from converters.files.fetch import Fetched
+from converters.files.fetch import Fetched, path_text
 from converters.files.file_probe import json_in
 from converters.files.torch_archive import Archive
 from converters.files.zip_archives import ZIP_ERRORS, entry_of, open_archive
@@ -61,13 +61,15 @@ def _statistics(given: Fetched, wanted: str | None) -> tuple[Path | None, tuple[
     """Return the file with the statistics of the observations, and notes on what is missing or left out."""
     if wanted not in (None, NO_NORMALISER):
         return Path(wanted), ()
-    found = statistics_beside(given.path)
+    found, others = statistics_beside(given, wanted=wanted != NO_NORMALISER)
     if wanted == NO_NORMALISER:
-        said = () if found is None else (f"{found.name} is left out (--set normaliser=none): {_NORMALISED}",)
-        return None, said
+        seen = ", ".join(file.name for file in ([found] if found else others))
+        return None, ((f"{seen} is left out (--set normaliser=none): {_NORMALISED}",) if seen else ())
+    names = ", ".join(map(path_text, others[:4])) + (f" and {len(others) - 4} more" if len(others) > 4 else "")
+    seen_too = (f"other statistics of VecNormalize were seen and not taken: {names} (--normaliser FILE takes one)",)
     settings = settings_that_normalise(given) if found is None else None
     if settings is None:
-        return found, ()
+        return found, (seen_too if others else ())
     return None, (
         f"{settings.name} says that it was trained behind VecNormalize, and vecnormalize.pkl is missing beside it: "
         f"{_NORMALISED}, or give the file: --normaliser FILE",
