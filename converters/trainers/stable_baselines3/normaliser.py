@@ -76,11 +76,17 @@ class Normaliser(Struct):
         self.applied[name] = moments = self._of_shape(key, shape)
         mean, deviation = moments.mean, moments.deviation
         high = mean.astype(FLOAT32)
-        centred = net.add("Sub", [x, net.const(high, "mean")])
-        if (np.abs(mean) > _FAR * deviation).any():
-            centred = net.add("Sub", [centred, net.const((mean - high).astype(FLOAT32), "rest_of_mean")])
-        scaled = net.add("RealDiv", [centred, net.const(deviation.astype(FLOAT32), "deviation")])
-        return clip(net, scaled, -self.limit, self.limit)
+        centred, width = net.add("Sub", [x, net.const(high, "mean")]), net.const(deviation.astype(FLOAT32), "deviation")
+        if not (np.abs(mean) > _FAR * deviation).any():
+            return clip(net, net.add("RealDiv", [centred, width]), -self.limit, self.limit)
+        # Clipped between the two parts of the mean: TensorFlow folds two subtractions in a row into one constant, and
+        # OpenVINO a subtraction and a factor into a product and a sum, which loses the digits again.
+        rest, reach = mean - high, self.limit * deviation
+        low, upper, part = (
+            net.const(v.astype(FLOAT32), n)
+            for v, n in ((rest - reach, "low"), (rest + reach, "high"), (rest, "rest_of_mean"))
+        )
+        return net.add("RealDiv", [net.add("Sub", [clip(net, centred, low, upper), part]), width])
 
     def _of_shape(self, key: str, shape: tuple[int, ...]) -> Moments:
         """Return the statistics of an observation of this shape.
