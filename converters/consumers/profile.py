@@ -24,7 +24,7 @@ class Profile(Struct, frozen=True, eq=False, kw_only=True):
     must play it. ``opset`` is the ONNX opset.
     ``code`` is the snippet that says how to use its files. ``loaders`` are those of
     ``converters/consumers/robots/loaders.py`` whose rules the ONNX must meet. ``batch`` is the number of agents that
-    the files are for (None: any). ``noise`` is what ``--noise`` may say of files in its names: it feeds none, so that
+    the files are for (None: any). ``noise`` is what ``--noise`` may say of files in its names: most feed none, so that
     the model draws it or has none.
     """
 

@@ -21,7 +21,9 @@ _GENERATIONS = (
     (Generation("tfsharp-0.4", pictures=_GREY), "ML-Agents 0.4 (plugin of TensorFlow 1.7)"),
     (Generation("tfsharp-0.3", pictures=_COLOURS), "ML-Agents 0.3 (plugin of TensorFlow 1.4)"),
     (
-        Generation("tfsharp-0.2", vector="state", visual="observation_", previous=False, memory_constant=False),
+        Generation(
+            "tfsharp-0.2", vector="state", visual="observation_", previous=False, noise=True, memory_constant=False
+        ),
         "ML-Agents 0.1 and 0.2 (plugin of TensorFlow 1.1 or 1.2)",
     ),
 )
@@ -33,6 +35,7 @@ TFSHARP = tuple(
         formats=(FROZEN_GRAPH.key,),
         dress=partial(dress, generation=g),
         code="internal-brain",
+        noise=("lift", "keep", "zero") if g.noise else ("keep", "zero"),
     )
     for g, purpose in _GENERATIONS
 )

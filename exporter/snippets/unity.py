@@ -38,7 +38,8 @@ _INTERNAL = (
     Generation("0.3-0.4", *_VECTOR, previous_rank=1, asks=True),
     Generation("0.5", *_VECTOR, previous_rank=2, masks=True, branches=True, asks=True),
 )
-_FIXED = ("vector_observation", "prev_action", "epsilon", "action_masks", "recurrent_in")
+_NOISE = "epsilon"
+_FIXED = ("vector_observation", "prev_action", _NOISE, "action_masks", "recurrent_in")
 _NEEDED = (VERSION_NUMBER, IS_CONTINUOUS, MEMORY_SIZE, ACTION_SHAPE)
 
 
@@ -92,7 +93,7 @@ def _settings(bundle: Bundle, able: Sequence[Generation]) -> list[str]:
 
 
 def _placeholders(bundle: Bundle, scope: str) -> list[tuple[str, str]]:
-    """Inputs that the brain does not know are drawn from a range, one number for all."""
+    """Inputs that the brain does not know are drawn from a range, one number for all; a node must have each name."""
     rows = []
     for spec in bundle.signature.inputs:
         name, kind = spec.name.removeprefix(scope), "Floating Point" if spec.dtype == "float32" else "Integer"
@@ -101,7 +102,8 @@ def _placeholders(bundle: Bundle, scope: str) -> list[tuple[str, str]]:
             rows.append(("Graph Placeholder", text))
         elif spec.role is Role.PARAMETER:
             rows.append(("Graph Placeholder", f"{name}: {kind}, Min Value and Max Value: its value"))
-    return rows
+    unread = "" if rows or f"{scope}{_NOISE}" not in bundle.nodes else f" ({_NOISE} may stay there: nothing reads it)"
+    return [("Graph Placeholders", f"Size {len(rows)}{unread}"), *rows]
 
 
 def _brain(bundle: Bundle, vectors: list[TensorSpec], images: list[TensorSpec]) -> list[tuple[str, str]]:

@@ -15,6 +15,7 @@ from converters.compiler.options import CompileOptions, NoiseMode
 from converters.consumers.profile import Profile
 from converters.consumers.profiles import PROFILES, profile
 from converters.formats.barracuda.format import parse
+from converters.formats.frozen_graph.reader import read_graph
 from converters.graph.run import run_graph
 from converters.graph.shapes import infer_types
 from converters.graph.types import BATCH
@@ -223,6 +224,29 @@ def test_the_last_action_goes_with_the_memory_where_nothing_feeds_it(tmp_path: P
     (made,) = export_model(path, tmp_path / "out", for_="tfsharp-0.2", verify="none")
     asked = commands.export_model("verify", made.folder, "--runtimes", "numpy", "--allow-unverified")
     assert asked.status == 0, asked.err
+
+
+@pytest.mark.parametrize("deterministic", [True, False])
+@pytest.mark.parametrize("source", ["continuous.bytes", "sb3_zip/ppo_box.zip", "sb3_zip/sac_box.zip"])
+def test_a_scene_of_the_first_releases_feeds_epsilon(source: str, deterministic: bool, tmp_path: Path) -> None:
+    """Graph Placeholders, size 1: epsilon, floating point, 0 to 0 (../shared/seeds, 001 and 002): float32 [1]."""
+    (made,) = export_model(
+        ROOT / "fixtures" / source, tmp_path, for_="tfsharp-0.2", verify="none", deterministic=deterministic
+    )
+    graph = read_graph((made.folder / f"{made.policy.name}.bytes").read_bytes())
+    assert [n.op for n in graph.nodes if n.name == "epsilon"] == ["Placeholder"]
+    state = np.random.default_rng(0).standard_normal((3, graph["state"].dims[1] or 0)).astype(np.float32)
+
+    def act(*epsilon: float) -> np.ndarray:
+        return run_graph(graph, {"state": state, "epsilon": np.array(epsilon, np.float32)}, ["action"])["action"]
+
+    (plain,) = compiled(ROOT / "fixtures" / source, CompileOptions(deterministic=True))
+    wanted = run_graph(plain.graph, {plain.feeds["state"]: state}, [plain.fetches["action"]])
+    np.testing.assert_allclose(act(0), wanted[plain.fetches["action"]], 1e-5, 1e-5)
+    assert np.array_equal(act(0), act(0.5)) == deterministic
+    said = commands.export_model("snippets", made.folder, "--for", "internal-brain").out
+    assert f"Graph Placeholders            Size {0 if deterministic else 1}" in said
+    assert ("epsilon: Floating Point, Min Value 0, Max Value 0" in said) is not deterministic
 
 
 @pytest.mark.parametrize("remembers", [True, False])

@@ -4,7 +4,8 @@ What CoreBrainInternal.cs (0.1 to 0.5) and TFSharpInferenceEngine.cs (0.6) feed 
 int32 [B] in 0.3 and 0.4, [B, branches] from 0.5 on (0.1 and 0.2 do not feed it: there it goes with the memory),
 ``action_masks`` from 0.5 on, memory [B, M]. Up to 0.5 a discrete ``action`` is int64, drawn in the graph; from 0.6 on
 it is log-probabilities that the C# side draws from. Noise is drawn in the graph, as the trainers of 0.3 on did it: the
-*Graph Placeholders* of the Inspector stay empty.
+*Graph Placeholders* of the Inspector stay empty. In 0.1 and 0.2 it is an input: their documentation has each scene of
+continuous control made with a Graph Placeholder ``epsilon``, floating point, 0 to 0, which feeds float32 [1] for all.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from msgspec import Struct
 
 from converters.consumers.mlagents import input_mapping as feeding
 from converters.consumers.mlagents.memory import action_columns, give_memory, previous_action, take_memory
-from converters.consumers.mlagents.names import ACTION, PREVIOUS, SEQUENCE, VECTOR, VISUAL
+from converters.consumers.mlagents.names import ACTION, EPSILON, PREVIOUS, SEQUENCE, VECTOR, VISUAL
 from converters.consumers.mlagents.naming import Dressing
 from converters.consumers.mlagents.output_mapping import (
     Heads,
@@ -43,6 +44,8 @@ class Generation(Struct, frozen=True):
     previous: bool = True
     #: what is wrong with its pictures
     pictures: str | None = None
+    #: the scene feeds epsilon
+    noise: bool = False
     #: memory_size is read before the first step; sequence_length is fed whether the graph has it or not
     memory_constant: bool = True
     #: the four constants of 0.6, and log-probabilities as the action
@@ -57,6 +60,8 @@ def dress(policy: Policy, generation: Generation) -> Policy:
     masks = _take_masks(dressing, generation)
     carried = _take_previous_action(dressing, generation)
     state = take_memory(dressing, carried, _rows)
+    if generation.noise:
+        _take_noise(dressing)
     dressing.take_over(lambda spec: feeding.drawn_inside(dressing, spec))
     found = heads(dressing)
     if found.continuous is not None and found.discrete is not None:
@@ -67,7 +72,10 @@ def dress(policy: Policy, generation: Generation) -> Policy:
         )
     width = _give_action(dressing, generation, found, masks)
     memory = give_memory(dressing, state, _rows)
-    return dressing.finish(memory, _lookup_nodes(generation, found, width, state.size))
+    nodes = _lookup_nodes(generation, found, width, state.size)
+    if generation.noise and found.continuous is not None and EPSILON not in dressing.feeds:
+        nodes.append(Node(EPSILON, "Placeholder", attrs={"dtype": FLOAT32, "shape": TensorShape((None, width))}))
+    return dressing.finish(memory, nodes)
 
 
 def _rows(size: int) -> tuple[int | None, ...]:
@@ -117,6 +125,24 @@ def _take_previous_action(dressing: Dressing, generation: Generation) -> TensorS
     shape: tuple[int | None, ...] = (None, action_columns(spec)) if generation.branches else (None,)
     dressing.give_in(spec, dressing.take(PREVIOUS, spec, shape, INT32))
     return None
+
+
+def _take_noise(dressing: Dressing) -> None:
+    """Take the noise of a continuous action as ``epsilon``, of which the scene feeds a single number for all.
+
+    It becomes a row for each agent, whatever reads it. Noise of another shape is drawn inside.
+    """
+    spec = next(iter(dressing.policy.signature.noise), None)
+    if spec is None or len(spec.shape) != 2 or spec.shape[1] is None or not _is_continuous(dressing.policy):
+        return
+    builder, width = dressing.builder, spec.shape[1]
+    rows = builder.broadcast(builder.floats(np.zeros((1, width)), "no_noise"), (BATCH, width))
+    taken = dressing.take(EPSILON, spec, (None, width))
+    dressing.give_in(spec, builder.add("Add", [rows, taken], f"{spec.name}/for_each"))
+
+
+def _is_continuous(policy: Policy) -> bool:
+    return any(s.role is Role.CONTINUOUS for s in policy.signature.outputs)
 
 
 def _give_action(dressing: Dressing, generation: Generation, found: Heads, masks: str | None) -> int:
