@@ -207,13 +207,14 @@ def compare(
     *,
     names: Mapping[str, str] | None = None,
     read: ReadOptions | None = None,
+    candidate_read: ReadOptions | None = None,
     verify: str | Sequence[str] | VerifyOptions = "auto",
     allow_unverified: bool = False,
 ) -> ParityReport:
     """Compare files that any tool made with a reference; every format of a candidate that is a bundle takes part.
 
-    - ``names``: a name of the reference → what the candidates call it.
-    - ``read``: how to read the reference; ``verify``: as for ``export``.
+    - ``names``: a name of the reference → what the candidates call it, where their roles do not tell.
+    - ``read``: how to read the reference; ``candidate_read``: the candidates; ``verify``: as for ``export``.
     - ``allow_unverified``: no error where none of the candidates' runtimes is installed.
 
     Raises ExportModelError::
@@ -227,6 +228,8 @@ def compare(
         judging=judged_by(verify),
         understanding=compile_options(read),
         read=read.for_reader(),
+        candidate_understanding=None if candidate_read is None else compile_options(candidate_read),
+        candidate_read=None if candidate_read is None else candidate_read.for_reader(),
         allow_unverified=allow_unverified,
     )
     return compare_artefacts(reference, candidates, options)

@@ -10,7 +10,16 @@ import click
 
 from exporter.cli.console import Console, reporting
 from exporter.cli.group import PATH, command
-from exporter.cli.options import JUDGING, as_given, comparing, located, pairs, reading, understanding
+from exporter.cli.options import (
+    JUDGING,
+    as_given,
+    comparing,
+    located,
+    pairs,
+    reading,
+    reading_candidates,
+    understanding,
+)
 
 if TYPE_CHECKING:
     from converters.compiler.options import CompileOptions
@@ -22,7 +31,7 @@ if TYPE_CHECKING:
 @command(
     "compare",
     "Compare files made by any tool with a reference.",
-    ("export-model compare 3DBall.bytes theirs.onnx", ""),
+    ("export-model compare policy.pt policy.onnx", ""),
     ("export-model compare 3DBall.bytes tfjs --map action=Identity", ""),
     core=("mapped", "runtimes", "allow_unverified", "trust_source", "html", "junit", "as_json", "verbose", "quiet"),
 )
@@ -32,14 +41,17 @@ if TYPE_CHECKING:
 @located
 @click.option("--allow-unverified", is_flag=True, help="Succeed even if none of their runtimes is installed.")
 @reporting
+@reading_candidates
 @understanding
-@reading("trust_source", "sensors", "activation", "script", "normaliser")
+@reading()
 @comparing
 def compare_command(
     reference: Path,
     candidates: tuple[Path, ...],
     mapped: tuple[str, ...],
     read: ReadOptions,
+    candidate_read: ReadOptions,
+    candidate_compiling: CompileOptions,
     runtimes: str,
     allow_unverified: bool,
     compiling: CompileOptions,
@@ -63,6 +75,8 @@ def compare_command(
                 judging=replace(options, runtimes=runtimes),
                 understanding=compiling,
                 read=read,
+                candidate_understanding=candidate_compiling,
+                candidate_read=candidate_read,
                 allow_unverified=allow_unverified,
             ),
             progress=progress,

@@ -50,6 +50,13 @@ GROUPS = {
         *("source", "step", "brain", "inputs", "outputs", "values", "mapped", "sensors", "activation", "script"),
         *("normaliser", "interface", "trust_source"),
     ),
+    "How to read the candidates": tuple(
+        f"candidate_{name}"
+        for name in (
+            *("step", "brain", "inputs", "outputs", "values", "sensors", "activation", "script", "normaliser"),
+            "interface",
+        )
+    ),
     "What Unity would say": ("releases", "actions", "brain_parameters"),
     "How to play": ("env", "episodes", "most", "likeliest", "margin", "strict", "partner"),
     "How to verify": (

@@ -50,14 +50,17 @@ def one_bundle(place: Path, command: str) -> Path:
 
 
 def as_given(names: Container[str]) -> list[str]:
-    """The options of this call whose parameters ``names`` has, word for word, where the command line had them."""
+    """The options of this call whose parameters ``names`` has, word for word, where the command line had them.
+
+    What ``reading_candidates`` adds counts as what it repeats.
+    """
     from converters.files.fetch import path_text
 
     context = click.get_current_context()
     words: list[str] = []
     for option in context.command.params:
         name = option.name
-        if not isinstance(option, click.Option) or name is None or name not in names:
+        if not isinstance(option, click.Option) or name is None or name.removeprefix(CANDIDATE) not in names:
             continue
         if context.get_parameter_source(name) is not ParameterSource.COMMANDLINE:
             continue
@@ -91,6 +94,8 @@ JUDGING = frozenset(
         *("golden", "sizes", "tolerances", "atol", "rtol", "required"),
     )
 )
+#: What stands before an option that is for the candidates of a comparison, not for the reference.
+CANDIDATE = "candidate_"
 #: What of it a bundle is verified with that an export was judged by.
 RULES = frozenset(("golden", "sizes", "tolerances", "atol", "rtol", "required"))
 
@@ -215,6 +220,38 @@ def understanding(command: Callable[..., Any]) -> Callable[..., Any]:
     ):
         parse_and_call = option(parse_and_call)
     return parse_and_call
+
+
+def reading_candidates(command: Callable[..., Any]) -> Callable[..., Any]:
+    """The options of ``reading`` and ``understanding`` again, as --candidate-…; --trust-source is for both sides.
+
+    The command gets them as ``candidate_read`` and ``candidate_compiling``.
+    """
+
+    @understanding
+    @reading()
+    def collect(*, read: Any, compiling: Any) -> Any:
+        return {"candidate_read": read, "candidate_compiling": compiling}
+
+    options = [o for o in getattr(collect, "__click_params__") if o.name != "trust_source"]  # noqa: B009
+
+    @functools.wraps(command)
+    def parse_and_call(*args: Any, trust_source: bool, **rest: Any) -> Any:
+        told = {option.name: rest.pop(f"{CANDIDATE}{option.name}") for option in options}
+        return command(*args, trust_source=trust_source, **collect(trust_source=trust_source, **told), **rest)
+
+    made: Callable[..., Any] = parse_and_call
+    for option in options:
+        flag = option.opts[0].removeprefix("--")
+        made = click.option(
+            f"--candidate-{flag}",
+            f"{CANDIDATE}{option.name}",
+            type=option.type,
+            multiple=option.multiple,
+            metavar=option.metavar,
+            help=f"--{flag}, for the candidates.",
+        )(made)
+    return made
 
 
 def coding(command: Callable[..., Any]) -> Callable[..., Any]:

@@ -1,9 +1,9 @@
 """``export-model compare``: artefacts that any tool made, held against a reference.
 
-The reference is read as a policy, so that it says what to draw for its inputs and which outputs are drawn. A candidate
-is not read, only fed: its names are taken from its file, matched with the reference's, and it is run in the runtimes of
-its format, as far as a file that anyone may have made is given to one. What it lacks, has too much or calls otherwise
-is a failure that says what to map.
+Both sides are read as policies, by the rules of ``export``. A candidate whose own names, batch and memories are those
+of the reference is fed as it is, in every runtime of its format (``Candidate``), as far as a file that anyone may have
+made is given to one; any other answers for the policy that was read (``ReadCandidate``), tensor by tensor by its role.
+What it lacks or has too much is a failure.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ from converters.files.folders import scratch_folder, size_of
 from converters.formats.source import OriginalRun, ReadOptions
 from converters.policy.policy import Policy
 from converters.runtimes.pool import RuntimePool, chosen_runtimes
-from exporter.compare.matching import Candidate, match_candidates
+from exporter.compare.matching import AnyCandidate, Candidate, match_candidates
+from exporter.compare.reading import ReadCandidate, read_participants
 from exporter.compare.weights import compare_rounded, merge_reports, rounded_to
 from exporter.export.sources import read_source
 from exporter.remote.fetching import nearby
@@ -65,6 +66,9 @@ class CompareOptions(Struct, frozen=True, kw_only=True):
     #: how to read the reference (the flags ``--input``, ``--output``, ``--step``, …)
     understanding: CompileOptions | None = None
     read: ReadOptions | None = None
+    #: how to read the candidates
+    candidate_understanding: CompileOptions | None = None
+    candidate_read: ReadOptions | None = None
     #: no error where none of the candidates' runtimes is installed
     allow_unverified: bool = False
 
@@ -99,15 +103,17 @@ def compare_artefacts(
         policy, source = _reference(reference, options.understanding, options.read)
         if understood is not None:
             understood(policy)
-        matched = match_candidates(policy, reference, near, options.names)
-        used, known = chosen_runtimes(judging.runtimes, [m.format for m in matched])
+        reads = options.candidate_read, options.candidate_understanding
+        matched = match_candidates(policy, reference, near, options.names, *reads)
+        used, known = chosen_runtimes(judging.runtimes, [form for m in matched for form in m.forms])
         _check_options(judging, policy, matched, used)
         running = opened.enter_context(RuntimePool()) if pool is None else pool
         session = Session(used, known, running, judging, progress)
         comparison = _Comparison(policy, source, session, judge, Path(opened.enter_context(scratch_folder())))
         report = comparison.report(matched, rounded_to(reference))
-    notes = [f"not compared, as {m.label} never had it: {', '.join(m.missing_ok)}" for m in matched if m.missing_ok]
-    report = replace(report, notes=(*report.notes, *notes))
+    notes = [note for m in matched for note in m.notes(policy, used)]
+    ran = any(isinstance(m, Candidate) or m.place(used)[0] is None for m in matched)
+    report = replace(report, notes=(*report.notes, *notes), self_consistent=report.self_consistent and not ran)
     if report.passed is None and not report.undecided and not (options.allow_unverified or judging.runtimes == "none"):
         raise RuntimeUnavailableError(
             "no runtime that runs the candidates is installed, so nothing was compared",
@@ -126,7 +132,7 @@ class _Comparison(Struct, frozen=True):
     judge: Judge
     folder: Path
 
-    def report(self, matched: Sequence[Candidate], own: Storage | None) -> ParityReport:
+    def report(self, matched: Sequence[AnyCandidate], own: Storage | None) -> ParityReport:
         """Compare the candidates; those whose weights were rounded otherwise than the reference's (``own``) apart."""
         reference = write_reference(self.policy, self.folder)
         copies = [(m, _safe_copy(m, self.folder / str(number))) for number, m in enumerate(matched)]
@@ -134,7 +140,7 @@ class _Comparison(Struct, frozen=True):
         reports = []
         for storage in dict.fromkeys(kept):
             chosen = [copy for copy, of in zip(copies, kept, strict=True) if of == storage]
-            sizes = {m.label: size_of(m.ports.path) for m, _ in chosen}
+            sizes = {m.label: size_of(m.path) for m, _ in chosen}
             tested = policy_under_test(
                 self.policy, {}, self.folder, sizes=sizes, reference=reference, source=self.source
             )
@@ -145,10 +151,14 @@ class _Comparison(Struct, frozen=True):
                 reports.append(compare_rounded(tested, self.policy, storage, self.folder, compared, self.session))
         return merge_reports(reports)
 
-    def _compare(self, candidates: Sequence[tuple[Candidate, Path]], tested: PolicyUnderTest) -> ParityReport:
+    def _compare(self, candidates: Sequence[tuple[AnyCandidate, Path]], tested: PolicyUnderTest) -> ParityReport:
         def taking_part(numpy_model: LoadedModel, failure: Failure) -> Iterator[Participant]:
             for candidate, copy in candidates:
-                yield from self._participants(candidate, copy, numpy_model, failure)
+                if isinstance(candidate, Candidate):
+                    yield from self._participants(candidate, copy, numpy_model, failure)
+                else:
+                    running = self.session.runtimes, self.session.pool
+                    yield from read_participants(candidate, self.policy, *running, copy, failure)
 
         return self.judge(tested, self.session, taking_part)
 
@@ -181,7 +191,7 @@ class _Comparison(Struct, frozen=True):
 
 
 def _check_options(
-    options: VerifyOptions, policy: Policy, matched: Sequence[Candidate], runtimes: Sequence[str]
+    options: VerifyOptions, policy: Policy, matched: Sequence[AnyCandidate], runtimes: Sequence[str]
 ) -> None:
     """Raise UsageError where a budget or a tolerance is for something that takes no part."""
     check_budget(options.budget, {m.label: 0 for m in matched})
@@ -204,8 +214,14 @@ def _reference(
     return policy, model.original
 
 
-def _safe_copy(candidate: Candidate, folder: Path) -> Path:
-    """A copy of the candidate as far as a runtime may be given it: anyone may have made it. Raises ExportModelError."""
+def _safe_copy(candidate: AnyCandidate, folder: Path) -> Path:
+    """A copy of the candidate as far as a runtime may be given it: anyone may have made it. Raises ExportModelError.
+
+    One that was read is run within its reader's own rules: for it the folder is empty.
+    """
+    if isinstance(candidate, ReadCandidate):
+        folder.mkdir()
+        return folder
     found, ports = candidate.format, candidate.ports
     folder.mkdir()
     if found.vetted is None:

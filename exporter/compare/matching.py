@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
+from converters.compiler.options import CompileOptions
 from converters.compiler.passes.weights import Storage
+from converters.files.fetch import Fetched
 from converters.formats.bundle.bundle import Bundle
 from converters.formats.format import Format, Port, Ports
 from converters.formats.read import ports_of
+from converters.formats.recognise import recognise_path
+from converters.formats.source import ReadOptions
 from converters.policy.policy import Policy
 from exporter.compare.fit import misfit
+from exporter.compare.reading import ReadCandidate, read_candidate
 from exporter.compare.weights import rounded_to
 from exporter.verify.participants import (
     Feeds,
@@ -50,8 +56,27 @@ class Candidate(Struct, frozen=True):
     problems: tuple[Problem, ...]
     #: outputs that export-model made for the reference, and that this one has none of
     missing_ok: tuple[str, ...] = ()
+    #: names that its roles gave, as "the reference's = its own"
+    by_role: tuple[str, ...] = ()
     #: what its weights were rounded to, where they were
     weights: Storage | None = None
+
+    @property
+    def path(self) -> Path:
+        """What a loader is given."""
+        return self.ports.path
+
+    @property
+    def forms(self) -> tuple[Format, ...]:
+        """The formats that it may be run as."""
+        return (self.format,)
+
+    def notes(self, reference: Policy, runtimes: Sequence[str]) -> Iterator[str]:
+        """Yield what was not compared, or under another name, as sentences."""
+        if self.missing_ok:
+            yield f"not compared, as {self.label} never had it: {', '.join(self.missing_ok)}"
+        if self.by_role:
+            yield f"{self.label}: {', '.join(self.by_role)}, by their roles"
 
     def own_feeds(self, feeds: Feeds) -> dict[str, np.ndarray]:
         """What it is fed, by its own names, for the reference's inputs."""
@@ -69,27 +94,118 @@ class Candidate(Struct, frozen=True):
         return [p.name for p in self.problems if not p.blocking]
 
 
+#: Fed by its own names, or answering as it was read.
+AnyCandidate: TypeAlias = Candidate | ReadCandidate
+
+
+class Artefact(Struct, frozen=True):
+    """One file or folder of a candidate; ``ports`` is None where no runtime loads it by itself."""
+
+    place: Path
+    format: Format
+    ports: Ports | None
+
+    @property
+    def path(self) -> Path:
+        """What a loader or a reader is given."""
+        return self.place if self.ports is None else self.ports.path
+
+
 def match_candidates(
-    policy: Policy, reference: Path, near: Sequence[Path], names: Mapping[str, str]
-) -> list[Candidate]:
-    """The artefacts at the paths with the reference's names. Raises UsageError where there is none."""
-    artefacts = [(path, *found) for path in near for found in ports_of(path)]
+    policy: Policy,
+    reference: Path,
+    near: Sequence[Path],
+    names: Mapping[str, str],
+    read: ReadOptions | None = None,
+    understanding: CompileOptions | None = None,
+) -> list[AnyCandidate]:
+    """Return what is at the paths with the reference's names: fed by its own names where these fit, else as it is read.
+
+    ``read`` and ``understanding`` say how candidates are read. Raises UsageError where there is none or a name of
+    ``names`` is none, and ExportModelError where a candidate can be neither fed nor read.
+    """
+    artefacts = [a for path in near for a in _artefacts(path)]
     if not artefacts:
         raise UsageError("no candidate was given", fix="export-model compare REFERENCE CANDIDATE...")
-    aliases = _with_user_names(_aliases(policy, reference), names, [p for *_, p in artefacts])
+    labels = labels_of(artefacts)
+    readings = [
+        _reading(label, a, policy, names, read, understanding) for label, a in zip(labels, artefacts, strict=True)
+    ]
+    ports = [p for a in artefacts if a.ports for p in (*a.ports.inputs, *a.ports.outputs)]
+    known = [p.name for p in ports] + [n for r in readings if r is not None for n in r.names]
+    aliases = _with_user_names(_aliases(policy, reference), names, known)
     made = _made_here(reference, policy)
     return [
-        replace(_match(label, kind, ports, policy, aliases, made), weights=rounded_to(path))
-        for label, (path, kind, ports) in zip(labels_of(artefacts), artefacts, strict=True)
+        _chosen(label, artefact, reading, policy, aliases, made)
+        for label, artefact, reading in zip(labels, artefacts, readings, strict=True)
     ]
 
 
-def labels_of(found: Sequence[tuple[Path, Format, Ports]]) -> list[str]:
+def _artefacts(path: Path) -> list[Artefact]:
+    kind = recognise_path(Fetched(path))
+    if kind.ports is None and kind.readable:
+        return [Artefact(path, kind, None)]
+    return [Artefact(path, form, ports) for form, ports in ports_of(path)]
+
+
+def _reading(
+    label: str,
+    artefact: Artefact,
+    policy: Policy,
+    names: Mapping[str, str],
+    read: ReadOptions | None,
+    understanding: CompileOptions | None,
+) -> ReadCandidate | None:
+    """Read a candidate; None for a bundle's, whose names are the canonical ones, and where it can only be fed."""
+    if not artefact.format.readable or (artefact.place / POLICY).is_file():
+        return None
+    try:
+        return read_candidate(label, artefact.place, policy, read, understanding, names)
+    except UsageError:
+        raise
+    except ExportModelError:
+        if artefact.ports is None:
+            raise
+        return None
+
+
+def _chosen(
+    label: str,
+    artefact: Artefact,
+    reading: ReadCandidate | None,
+    policy: Policy,
+    aliases: Mapping[str, tuple[str, ...]],
+    made: frozenset[str],
+) -> AnyCandidate:
+    """Feed it by its own names where these fit and mean the same, else as it is read."""
+    weights = rounded_to(artefact.place)
+    if artefact.ports is None:
+        assert reading is not None
+        return reading
+    if reading is None:
+        return replace(_match(label, artefact.format, artefact.ports, policy, aliases, made), weights=weights)
+    ports = (*artefact.ports.inputs, *artefact.ports.outputs)
+    keys = {_base(p.tensor): _base(p.name) for p in ports if p.tensor is not None}
+    own = {n: (*known, *(keys.get(o, o) for o in reading.own_names(n))) for n, known in aliases.items()}
+    fed = _match(label, artefact.format, artefact.ports, policy, own, made)
+    read = reading if artefact.ports.open else reading.limit_outputs({_base(p.tensor or p.name) for p in ports})
+    if not reading.may_be_fed(policy):
+        return read
+    if fed.problems:
+        # What lacks an output either way is fed: then the numbers of its others say what to map.
+        blocked = any(p.blocking for p in fed.problems)
+        return read if blocked or not read.missing(policy) else replace(fed, weights=weights)
+    called = {**{n: p.name for n, p in fed.inputs.items()}, **fed.outputs}
+    by_role = tuple(f"{n} = {other}" for n, other in called.items() if _base(other) not in aliases[n])
+    return replace(fed, weights=weights, by_role=by_role)
+
+
+def labels_of(found: Sequence[Artefact]) -> list[str]:
     """What each candidate is called in the report: its format where that is enough, else with its path."""
-    formats = [kind.key for _, kind, _ in found]
-    if len(set(formats)) == len(formats) and len({path for path, *_ in found}) == 1:
+    formats = [a.format.key for a in found]
+    if len(set(formats)) == len(formats) and len({a.place for a in found}) == 1:
         return formats
-    paths = [ports.path.resolve() for *_, ports in found]
+    paths = [a.path.resolve() for a in found]
     for depth in range(2, max(len(p.parts) for p in paths) + 1):  # as much of the paths as tells them apart
         labels = [f"{key} {'/'.join(path.parts[-depth:])}" for key, path in zip(formats, paths, strict=True)]
         if len(set(labels)) == len(set(zip(formats, paths, strict=True))):
@@ -123,10 +239,9 @@ def _aliases(policy: Policy, path: Path) -> dict[str, tuple[str, ...]]:
 
 
 def _with_user_names(
-    aliases: Mapping[str, tuple[str, ...]], names: Mapping[str, str], artefacts: Sequence[Ports]
+    aliases: Mapping[str, tuple[str, ...]], names: Mapping[str, str], theirs: Sequence[str]
 ) -> dict[str, tuple[str, ...]]:
     """The aliases, with what --map says before all others of a name. Raises UsageError."""
-    ports = [p for i in artefacts for p in (*i.inputs, *i.outputs)]
     mapped = dict(aliases)
     for name, other in names.items():
         canonical = next((c for c, known in aliases.items() if _base(name) in known), None)
@@ -135,10 +250,10 @@ def _with_user_names(
                 f"--map {name}={other}: the reference has no input or output {name!r}",
                 fix=_suggestion(name, [a for known in aliases.values() for a in known]),
             )
-        if _find(other, ports) is None:
+        if other not in {*theirs, *map(_base, theirs)}:
             raise UsageError(
                 f"--map {name}={other}: no candidate has an input or output {other!r}",
-                fix=_suggestion(other, [p.name for p in ports]),
+                fix=_suggestion(other, theirs),
             )
         # A candidate that calls it as the reference does needs no map: with several, each is found by its own name.
         mapped[canonical] = (other, *aliases[canonical])

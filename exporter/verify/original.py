@@ -67,6 +67,13 @@ class Original:
     def _has_logits(self) -> bool:
         return bool(self.source.branches) and all(b is not None for b in self.source.branches)
 
+    @property
+    def answered(self) -> frozenset[str]:
+        """The outputs that it answers for."""
+        given = {n for n in self.source.fetches if self.signature.output(n).role is not Role.SAMPLED}
+        given |= {s.name for s in self.signature.outputs if s.name in self.source.parts}
+        return frozenset(given | {s.name for s in self.signature.outputs if self._derivable(s)})
+
     def run(self, feeds: Arrays) -> dict[str, np.ndarray]:
         """Every output it can answer for, for one set of canonical inputs."""
         return self.run_all([feeds])[0]
