@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from converters.files.fetch import Fetched, path_text, unreadable
@@ -42,24 +42,34 @@ def statistics_beside(given: Fetched, *, wanted: bool = True) -> tuple[Path | No
     """
     model = given.path
     beside, above = (_statistics_in(folder) for folder in (model.parent, Path(os.path.normpath(model.parent / ".."))))
-    seen = [*beside, *(file for file in above if file not in beside)]
-    known = (folder / name for folder, names in _places(model) for name in names)
-    own = next((file for file in known if file.is_file()), None)
-    if own is not None and (own.name not in _STATISTICS or own.parent != model.parent):
+    seen = list(dict.fromkeys([*beside, *above]))
+    own = _named_after(model)
+    if own is not None:
         return own, [file for file in seen if file != own]
     free = [file for file in beside if not _is_anothers(file, model)]
     callback = model.stem in _OF_CALLBACKS or _OF_STEP.fullmatch(model.stem) is not None
     able = free or [file for file in above if not _is_anothers(file, model)]
     if able and able[0].name in _STATISTICS and (free or callback) and len({*map(given.bytes_of, able)}) == 1:
         return able[0], [file for file in seen if file != able[0]]
-    if not able or not wanted:
-        return None, seen
-    raise SourceError(
-        f"its observations may have been normalised by {' or '.join(file.name for file in able[:8])}",
-        why=f"statistics of VecNormalize lie {'beside it' if free else 'one folder up'}, and their names do not say "
-        "that they are of this model",
-        fix=f"say which: {' or '.join(f'--normaliser {path_text(file)}' for file in able[:8])}; none: "
-        "--set normaliser=none",
+    if able and wanted:
+        raise _undecided(able, "beside it" if free else "one folder up")
+    return None, seen
+
+
+def _named_after(model: Path) -> Path | None:
+    """Return the statistics that a model's name, or a folder of that name, says are its; None where none are."""
+    known = (folder / name for folder, names in _places(model) for name in names)
+    own = next((file for file in known if file.is_file()), None)
+    return None if own is None or (own.name in _STATISTICS and own.parent == model.parent) else own
+
+
+def _undecided(files: Sequence[Path], place: str) -> SourceError:
+    """The error for statistics at a place of which none is known to be the model's."""
+    named = [(file.name, f"--normaliser {path_text(file)}") for file in files[:8]]
+    return SourceError(
+        f"its observations may have been normalised by {' or '.join(name for name, _ in named)}",
+        why=f"statistics of VecNormalize lie {place}, and their names do not say that they are of this model",
+        fix=f"say which: {' or '.join(flag for _, flag in named)}; none: --set normaliser=none",
     )
 
 
