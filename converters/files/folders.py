@@ -75,6 +75,39 @@ def scratch_folder() -> OwnFolder:
     return OwnFolder(place, _SCRATCH)
 
 
+def live_folders() -> tuple[Path, ...]:
+    """The folders of this process's own that are there now."""
+    return tuple(_LIVE)
+
+
+def link_model(path: Path, folder: Path) -> Path:
+    """Give a model a second place in a new ``folder``: hard links, or copies where there can be none. Raises OSError.
+
+    ``path`` is a folder, with all in it, or a file, with those that are called after it (``<file>.data``,
+    ``<name>.weights.bin``).
+    """
+    if path.is_dir():
+        files = [Path(place, name) for place, _, names in os.walk(path) for name in names]
+    else:
+        names = (f"{path.name}.", f"{path.stem}.weights.")
+        files = [path, *(p for p in path.parent.iterdir() if p.name.startswith(names) and p.is_file())]
+    for file in files:
+        place = folder / file.relative_to(path.parent)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        _link_file(file.resolve(), place)
+    return folder / path.name
+
+
+def _link_file(file: Path, place: Path) -> None:
+    try:
+        if file.stat().st_uid == os.getuid():  # another's may be closed to a child of root, which is root no more
+            place.hardlink_to(file)
+            return
+    except (OSError, AttributeError):  # another file system, or none with links; Windows
+        place.unlink(missing_ok=True)
+    shutil.copyfile(file, place)
+
+
 def remove_all() -> None:
     """Remove what this process still has: it was told to stop, perhaps in the middle of removing it."""
     for path in list(_LIVE):

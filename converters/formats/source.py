@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -11,11 +11,13 @@ from msgspec import Struct, field
 from msgspec.structs import replace
 
 from converters.files import tensorflow_messages as schema
+from converters.files.children.process import RunFailedError
 from converters.files.external_data import Detached
 from converters.files.folders import scratch_folder
 from converters.formats.frozen_graph.subgraph import check, subgraph
 from converters.graph.nodes import Graph
 from converters.policy.facts import SourceFacts
+from signatures.errors import ExportModelError
 from signatures.spec import SourceMap
 
 
@@ -30,6 +32,8 @@ class OriginalRun(Struct, frozen=True):
     path: Path
     options: Mapping[str, Any] = field(default_factory=dict)
     definition: Any = None
+    #: writes a copy to a folder that holds what the file names elsewhere; returns the copy
+    copy: Callable[[Path], Path] | None = None
     #: what of the definition lies beside it
     detached: Detached = field(default_factory=Detached)
     #: the tensors that are asked for, and those that are fed: no more of the definition is run (None: all of it)
@@ -49,10 +53,17 @@ class OriginalRun(Struct, frozen=True):
     @contextmanager
     def loadable(self) -> Iterator[tuple[str, Mapping[str, Any]]]:
         """The path and the options that the child is told; what was written for it is gone afterwards."""
-        if self.definition is None:
+        if self.definition is None and self.copy is None:
             yield str(self.path), self.options
             return
         with scratch_folder() as folder:
+            if self.copy is not None:
+                try:
+                    file = self.copy(folder)
+                except ExportModelError as error:
+                    raise RunFailedError("cannot be given to its runtime", why=f"{error.what}: {error.why}") from error
+                yield str(file), self.options
+                return
             file = folder / "source.pb"
             part = self.definition if self.asked is None else subgraph(self.definition, *self.asked)
             schema.pieces(part, self.detached).write(file)

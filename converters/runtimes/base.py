@@ -14,6 +14,13 @@ if not TYPE_CHECKING:  # what asks a record for its signature looks these names 
 
 Progress = Callable[[str], None]
 
+#: What the child of a source code's runtime says by itself: no words of the program that it runs, nor of its compiler.
+REFUSED = "the compiler refuses it"
+OWN_WORDS = (
+    rf"(?:\w+Error: )?(?:{REFUSED}|its self test finds \d+ wrong numbers|its weights are refused with \d+|"
+    r"an index of \d+ inputs lies outside of the table that it is looked up in)"
+)
+
 
 class RuntimeInfo(Struct, frozen=True):
     """One runtime that artefacts can be verified in; ``how`` is the command that installs it."""
@@ -57,5 +64,8 @@ class Runtime(Struct, frozen=True):
     dtypes: frozenset[str] = frozenset()
     #: It runs in a browser (the word ``browser``).
     browser: bool = False
-    #: Its child gives up writing and the network; a browser needs both, and has a sandbox of its own.
+    #: Its child is confined as it starts; those that start a compiler confine themselves, and a browser has a sandbox.
     confined: bool = True
+    #: It runs source code, which may say anything; of that a report repeats what this pattern matches, which is its
+    #: child's own. None: it runs graphs.
+    own_words: str | None = None

@@ -19,8 +19,7 @@ _ON_REQUEST = frozenset(r.name for r in RUNTIMES if r.taken_by != "auto")
 #: Runtimes that no word takes.
 _BY_NAME = frozenset(r.name for r in RUNTIMES if r.taken_by == "name")
 _IN_BROWSERS = frozenset(r.name for r in RUNTIMES if r.browser)
-#: Runtimes that are not confined here: browsers have a sandbox of their own, and a compiler's process confines itself.
-_FREE = frozenset(r.name for r in RUNTIMES if not r.confined)
+_KNOWN = {r.name: r for r in RUNTIMES}
 _COMMANDS: Mapping[str, Callable[[], list[str]]] = {r.name: r.command for r in RUNTIMES}
 
 
@@ -82,8 +81,14 @@ class RuntimePool(AbstractContextManager["RuntimePool"]):
 
     def _launch(self, name: str) -> RuntimeProcess:
         if name not in self._processes:
+            known = _KNOWN.get(name)
             self._processes[name] = RuntimeProcess(
-                name, self._commands[name](), confined=name not in _FREE, timed_out=self._timed_out
+                name,
+                self._commands[name](),
+                confined=known is None or known.confined,
+                browser=known is not None and known.browser,
+                own_words=None if known is None else known.own_words,
+                timed_out=self._timed_out,
             )
         self._processes[name].launch()
         return self._processes[name]

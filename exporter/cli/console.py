@@ -169,7 +169,7 @@ class Console(Struct, frozen=True):
             say_paragraph(note, "  note: ", "    ")
 
     def _report(self, report: ParityReport) -> None:
-        from exporter.reports.summary import comparison_table, failure_lines, not_run_line, parity_table
+        from exporter.reports.summary import comparison_table, failure_lines, foreign_words, not_run_line, parity_table
 
         if not self.quiet and report.comparisons:
             for line in (comparison_table(report) if self.verbose else parity_table(report)).splitlines():
@@ -178,6 +178,8 @@ class Console(Struct, frozen=True):
         for line in failure_lines(report):
             indent = line[: len(line) - len(line.lstrip())]
             say_paragraph(line.lstrip(), indent, f"{indent}    ")
+        for line in foreign_words(report) if self.verbose else ():
+            say_lines(line)
         for played in report.played:
             say_paragraph(f"played in {played.environment}: {played.sentence}")
         missing = not_run_line(report)

@@ -9,6 +9,7 @@ from signatures.errors import UsageError
 
 #: Part of the confinement of a runtime's process → what it means.
 _SAID = {
+    "reading": "reads the system's programs, the interpreter and what it is handed only",
     "writing": "writes to a scratch folder only",
     "network": "has no network",
     "memory": "has bounded memory",

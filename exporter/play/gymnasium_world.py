@@ -212,11 +212,14 @@ def gymnasium_maker(env: str, known: Sequence[str]) -> MakeWorld:
 
 
 def own_maker(env: str) -> MakeWorld:
-    """Return what makes worlds of ``module:make``: code of the user's own, imported from the current folder, too."""
+    """Return what makes worlds of ``module:make``: code of the user's own, of the current folder where nobody has it.
+
+    The folder comes last: a file in it takes no other module's place.
+    """
     module, _, function = env.partition(":")
     here = str(Path.cwd())
     if here not in sys.path:
-        sys.path.insert(0, here)
+        sys.path.append(here)
     with _own_code(env, "importing it"):
         found = getattr(importlib.import_module(module), function, None)
     if not callable(found):

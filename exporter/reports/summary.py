@@ -7,9 +7,10 @@ from collections.abc import Sequence
 
 from converters.formats.registry import WRITTEN
 from exporter.tables import count_text, size_with_original, table
-from exporter.verify.findings import Finding, Undecided
+from exporter.verify.findings import Failure, Finding, Undecided
 from exporter.verify.report import ParityReport
 from exporter.verify.verdict import key_of, missing_runtimes
+from signatures.fields import printable
 
 
 def parity_table(report: ParityReport) -> str:
@@ -29,6 +30,16 @@ def comparison_table(report: ParityReport) -> str:
         rows = [[_word(c.passed), _output(c), c.kind, *c.columns(), c.worst_input or ""] for c in pair.findings]
         parts.append(f"{pair.format} in {pair.runtime}\n{table(head, rows)}")
     return "\n\n".join(parts)
+
+
+def foreign_words(report: ParityReport) -> list[str]:
+    """What programs said when they failed, each line marked as theirs, in printable characters."""
+    lines = []
+    for found in report.failures:
+        if isinstance(found, Failure) and found.said:
+            lines += [f"{found.where} said, in words of its own:"]
+            lines += [f"  | {printable(line)}" for line in found.said.splitlines()]
+    return lines
 
 
 def _word(passed: bool) -> str:

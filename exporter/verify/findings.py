@@ -6,6 +6,7 @@ import math
 from typing import Any, ClassVar, TypeVar
 
 from msgspec import Struct
+from msgspec.structs import replace
 
 from converters.files.children.process import RunFailedError
 from exporter.verify.difference import by_decade
@@ -247,6 +248,8 @@ class Failure(Finding, frozen=True):
 
     kind = "failure"
     wrong = "{0.where}: {0.reason}"
+    #: What a program that anyone may have made said of it: in no report, and on a terminal where it is asked for (-v).
+    said: str = ""
 
 
 class Undecided(Finding, frozen=True):
@@ -287,7 +290,7 @@ _Unanswered = TypeVar("_Unanswered", Failure, Undecided)
 
 def failure(kind: str, runtime: str, error: RunFailedError, output: str = "*") -> Failure:
     """What a runtime said when it gave no answer."""
-    return _without_numbers(Failure, kind, runtime, output, _error_text(error))
+    return replace(_without_numbers(Failure, kind, runtime, output, _error_text(error)), said=error.said)
 
 
 def undecided_reference(kind: str, runtime: str, error: RunFailedError) -> Undecided:

@@ -43,7 +43,7 @@ def room(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 @pytest.fixture
 def process(room: Path) -> Iterator[RuntimeProcess]:
-    with RuntimeProcess(CHROMIUM.name, CHROMIUM.command(), confined=False) as started:
+    with RuntimeProcess(CHROMIUM.name, CHROMIUM.command(), confined=False, browser=True) as started:
         started.start()
         yield started
 
@@ -86,7 +86,7 @@ def test_close_leaves_no_process_and_no_folder(room: Path, process: RuntimeProce
 def test_close_in_the_middle_of_the_start_leaves_no_process_and_no_folder(room: Path) -> None:
     """A run that fails elsewhere closes runtimes that were started ahead."""
     for delay in (0.3, 1.2):
-        process = RuntimeProcess(CHROMIUM.name, CHROMIUM.command(), confined=False)
+        process = RuntimeProcess(CHROMIUM.name, CHROMIUM.command(), confined=False, browser=True)
         process.launch()
         time.sleep(delay)
         process.close()
@@ -151,7 +151,7 @@ def test_a_chromium_that_does_not_start_is_an_answer(room: Path) -> None:
     assert node is not None
     script = [node, str(JS_SOURCE / "browser.mjs"), "--runtime", "tfjs-cpu@chromium", "--modules", str(js_home())]
     with (
-        RuntimeProcess("none", [*script, "--chromium", "/bin/false"], confined=False) as nowhere,
+        RuntimeProcess("none", [*script, "--chromium", "/bin/false"], confined=False, browser=True) as nowhere,
         pytest.raises(RuntimeUnavailableError, match="did not start"),
     ):
         nowhere.start()

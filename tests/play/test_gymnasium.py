@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from exporter.play.gymnasium_world import GymnasiumWorld
+from exporter.play.gymnasium_world import GymnasiumWorld, own_maker
 from exporter.play.options import PlayOptions
 from exporter.verify.options import VerifyOptions
 from exporter.verify.plays import EQUIVALENT
@@ -149,6 +149,16 @@ def test_code_of_the_users_own_plays_and_is_said_to_be(own: str) -> None:
 def test_what_goes_wrong_in_it_is_said_to_be_there(env: str, says: str, own: str) -> None:
     ran = export_model("play", fixture("continuous"), "--env", env, "--runtimes", "onnxruntime")
     is_refused(ran, says)
+
+
+def test_a_file_of_the_current_folder_takes_no_modules_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "quopri.py").write_text("make = 'of the current folder'")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [p for p in sys.path if p])
+    monkeypatch.delitem(sys.modules, "quopri", raising=False)
+    with pytest.raises(UsageError, match="has no function 'make'"):
+        own_maker("quopri:make")
+    assert Path(sys.modules["quopri"].__file__ or "").parent != tmp_path
 
 
 # ------------------------------------------------------------------ observations, masks, actions

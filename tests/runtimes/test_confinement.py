@@ -13,6 +13,7 @@ import pytest
 
 from converters.files.children import memory_limits as memory
 from converters.files.children.confinement import in_force
+from converters.files.children.environment import child_environment, readable_places
 from converters.files.children.memory_limits import FREE
 from converters.files.children.process import RunFailedError, RuntimeProcess
 from converters.files.children.python import child_command, confined_command
@@ -25,6 +26,14 @@ from tests.bench.big_policies import OBSERVED, frozen
 
 pytestmark = pytest.mark.skipif(not all(in_force().values()), reason="this kernel lacks Landlock or seccomp")
 
+#: Asked of what is neither terminal nor file: EPERM is the filter's answer, ENOTTY the kernel's.
+ASKED = """
+import fcntl, os
+try:
+    fcntl.ioctl(os.pipe()[0], {:#x}, bytes(32))
+except OSError as error:
+    exit(error.errno == 1)
+"""
 ATTEMPTS = {
     "write": "open({outside!r} + '/new', 'w')",
     "write over": "open({outside!r} + '/there', 'w')",
@@ -52,6 +61,22 @@ ATTEMPTS = {
     "share memory": "import ctypes; exit(ctypes.CDLL(None).shmget(0, 4096, 0o1600) < 0)",
     "use a keyring": "import ctypes; exit(ctypes.CDLL(None).syscall(250, 0, -3, 0) < 0)",
     "leave for a namespace": "import ctypes; exit(ctypes.CDLL(None).unshare(0x10000000) < 0)",
+    "read": "open({outside!r} + '/there').read()",
+    "read a folder": "import os; os.listdir({outside!r})",
+    "read its parent's variables": "import os; open(f'/proc/{{os.getppid()}}/environ').read()",
+    "read its parent's memory map": "import os; open(f'/proc/{{os.getppid()}}/maps').read()",
+    "read passwords": "open('/etc/shadow').read()",
+    "open by a handle": "import ctypes; exit(ctypes.CDLL(None).open_by_handle_at(-1, bytes(16), 0) < 0)",
+    "make a device": "import os; os.mknod({scratch!r} + '/null', 0o20600, os.makedev(1, 3))",
+    "type into a terminal": ASKED.format(0x5412),
+    "ask the console": ASKED.format(0x541C),
+    "make a file append-only": ASKED.format(0x40086602),
+    "set a file's attributes": ASKED.format(0x401C5820),
+    "have a capability": "exit(int(open('/proc/self/status').read().split('CapEff:')[1].split()[0], 16) & ~4 == 0)",
+    "keep accounts": "import ctypes; exit(ctypes.CDLL(None).acct({outside!r}.encode() + b'/there') < 0)",
+    "set the clock": "import time; time.clock_settime(time.CLOCK_REALTIME, time.time())",
+    "name the machine": "import socket; socket.sethostname(socket.gethostname())",
+    "reboot": "import ctypes; exit(ctypes.CDLL(None).syscall(169, 0xfee1dead, 672274793, 0, 0) < 0)",
     "trace its parent": "import ctypes, os; exit(ctypes.CDLL(None).ptrace(16, os.getppid(), 0, 0) != 0)",
 }
 
@@ -73,15 +98,16 @@ sys.exit(done.returncode)
 
 def tried(code: str, scratch: Path, way: str = OURS) -> subprocess.CompletedProcess[bytes]:
     command = [sys.executable, "-c", code]
+    variables = child_environment(scratch, readable_places(command))
     if way == COMPILER:
         command[2] = STARTING.format(scratch=str(scratch), code=code)
-        return subprocess.run(command, capture_output=True, check=False)
+        return subprocess.run(command, capture_output=True, check=False, env=variables)
     if way == OURS:
         *start, program = child_command("x")
         command = [*start, program.partition("import runpy")[0] + code]
     done = confined_command(command, str(scratch))
     assert any("confinement.py" in part for part in done) == (way == OTHERS)
-    return subprocess.run(done, capture_output=True, check=False)
+    return subprocess.run(done, capture_output=True, check=False, env=variables)
 
 
 @pytest.mark.parametrize(
@@ -95,7 +121,7 @@ def test_it_cannot(name: str, way: str, tmp_path: Path) -> None:
     (outside / "there").write_text("kept")
     (outside / "there").chmod(0o644)
     with socket.create_server(("127.0.0.1", 0)) as server:
-        code = ATTEMPTS[name].format(outside=str(outside), port=server.getsockname()[1])
+        code = ATTEMPTS[name].format(outside=str(outside), scratch=str(scratch), port=server.getsockname()[1])
         assert tried(code, scratch, way).returncode != 0
     assert [p.name for p in outside.iterdir()] == ["there"]
     found = (outside / "there").stat()
@@ -117,6 +143,19 @@ def test_it_cannot(name: str, way: str, tmp_path: Path) -> None:
 def test_it_can(code: str, way: str, tmp_path: Path) -> None:
     done = tried(code.format(scratch=str(tmp_path)), tmp_path, way)
     assert done.returncode == 0, done.stderr.decode()
+
+
+def test_a_part_that_is_refused_ends_the_process(tmp_path: Path) -> None:
+    """The kernel takes 16 rulesets of Landlock from a process: one more is not left out in silence."""
+    code = "from converters.files.children import confinement as c\nfor _ in range(17): c._landlock(None, ['/'])"
+    done = tried(code, tmp_path)
+    assert done.returncode != 0 and b"this process cannot be confined" in done.stderr
+
+
+@pytest.mark.parametrize("way", [OURS, OTHERS, COMPILER])
+def test_what_fails_is_the_attempt(way: str, tmp_path: Path) -> None:
+    """All that the attempts import is there, and a kernel that refuses none of them says so."""
+    assert tried("import ctypes, fcntl, os, pty, resource, socket, subprocess, time", tmp_path, way).returncode == 0
 
 
 def test_no_core_and_no_endless_file() -> None:

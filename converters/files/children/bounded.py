@@ -10,10 +10,11 @@ from pathlib import Path
 from converters.files.children import confinement
 
 
-def bounds(memory: int, seconds: int, *, starts: bool) -> Callable[[], None]:
+def bounds(folder: Path, memory: int, seconds: int, *, starts: bool) -> Callable[[], None]:
     """What a forked process does before it becomes a program: it bounds itself, for good, and ends with this one.
 
-    Bytes of memory, seconds of processor time, system calls; ``starts``: it may start processes.
+    Bytes of memory, seconds of processor time, system calls, and what it reads and, but in ``folder``, writes;
+    ``starts``: it may start processes.
     """
     parent = os.getpid()
 
@@ -23,7 +24,7 @@ def bounds(memory: int, seconds: int, *, starts: bool) -> Callable[[], None]:
         confinement.end_with(parent)
         resource.setrlimit(resource.RLIMIT_DATA, (memory, memory))
         resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
-        confinement.refuse_calls(starts=starts)
+        confinement.confine_started(str(folder), starts=starts)
 
     return bound
 
@@ -31,5 +32,7 @@ def bounds(memory: int, seconds: int, *, starts: bool) -> Callable[[], None]:
 def run_bounded(command: Sequence[str], folder: Path, memory: int, seconds: int) -> subprocess.CompletedProcess[str]:
     """Run a compiler whose every process has so many bytes of memory and seconds of processor time at most."""
     # one thread, so nothing can hold a lock across the fork
-    bound = bounds(memory, seconds, starts=True)
-    return subprocess.run(command, capture_output=True, text=True, check=False, cwd=folder, preexec_fn=bound)
+    bound = bounds(folder, memory, seconds, starts=True)
+    return subprocess.run(
+        command, capture_output=True, encoding="utf-8", errors="replace", check=False, cwd=folder, preexec_fn=bound
+    )

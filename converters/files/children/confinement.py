@@ -1,12 +1,13 @@
-"""What a runtime's process may do: read, compute, and write to a folder of its own.
+"""What a runtime's process may do: read what it needs, compute, and write to a folder of its own.
 
 A model file decides what a runtime computes, and runtimes have had faults. So a child gives up, before it has seen a
-model, what it does not need: files are not written outside a scratch folder, TCP is neither listened on nor called
-(Landlock, security/landlock.rst of the kernel's documentation); no socket of any other kind is made, no process
-started, no mode, owner, time or attribute of a file changed, and nothing shared with other processes (seccomp);
-no core is dumped, files and their number are bounded, for good. Memory is bounded while a request runs (process.py),
-because what is fair depends on it. It reads what the user can read. All of it is Linux; elsewhere, and where a kernel
-lacks a part, that part is not in force, and ``export-model runtimes`` says so.
+model, what it does not need: files are not written outside a scratch folder, nor read outside the places that it was
+told (environment.py), TCP is neither listened on nor called (Landlock, security/landlock.rst of the kernel's
+documentation); no socket of any other kind is made, no process started, no mode, owner, time or attribute of a file
+changed, and nothing shared with other processes (seccomp); no core is dumped, files and their number are bounded, for
+good; root's capabilities go. Memory is bounded while a request runs (process.py), because what is fair depends on it.
+All of it is Linux; elsewhere, and where a kernel lacks a part, that part is not in force, and ``export-model runtimes``
+says so. A part that the kernel has and refuses ends the process.
 
 A child in Python calls ``begin`` before anything else. For others this file is a program:
 ``python confinement.py FOLDER PARENT COMMAND…`` gives up the same and becomes the
@@ -16,7 +17,9 @@ command. It imports the standard library only.
 from __future__ import annotations
 
 import ctypes
+import errno
 import os
+import stat
 import struct
 import sys
 from collections.abc import Sequence
@@ -28,18 +31,24 @@ MAX_OPEN = 1024
 MAX_CPU = 4 * 3600
 #: The variable that tells a command with which parent the kernel kills it: it need not look by itself (js/serve.mjs).
 KILLED_WITH = "EXPORT_MODEL_KILLED_WITH"
+#: The variable that lists what a child may read, a path a line; of a folder that ends in ``/``, the names alone.
+READABLE = "EXPORT_MODEL_READABLE"
 
 # landlock.h: system calls (the same on all machines since they are new), rights, rules.
 _CREATE, _ADD, _RESTRICT = 444, 445, 446
 _VERSION = 1
 _PATH_BENEATH = 1
-_WRITE_FILE, _REMOVE_DIR, _REMOVE_FILE = 1 << 1, 1 << 4, 1 << 5
+_WRITE_FILE, _READ_FILE, _READ_DIR, _REMOVE_DIR, _REMOVE_FILE = 1 << 1, 1 << 2, 1 << 3, 1 << 4, 1 << 5
 _MAKE = sum(1 << bit for bit in range(6, 13))  # char, dir, reg, sock, fifo, block, sym
+_DEVICES = 1 << 6 | 1 << 11
 _REFER, _TRUNCATE, _IOCTL = 1 << 13, 1 << 14, 1 << 15
 _TCP = 0b11  # bind, connect
 _SCOPES = 0b11  # abstract sockets, signals
 _SET_NO_NEW_PRIVS, _SET_SECCOMP, _FILTER = 38, 22, 2
 _SET_PDEATHSIG, _SIGKILL = 1, 9
+# capability.h: root reads files of mode 600 (Landlock says which); its other capabilities go.
+_DROP_CAPABILITY, _AMBIENT, _CLEAR_ALL, _CAPABILITIES_3 = 24, 47, 4, 0x20080522
+_READ_SEARCH = 2
 
 #: What is refused → the numbers of its system calls on x86-64 and on AArch64 (asm/unistd.h of Linux 6.12).
 _REFUSED: dict[str, tuple[tuple[int, ...], tuple[int, ...]]] = {
@@ -64,6 +73,13 @@ _REFUSED: dict[str, tuple[tuple[int, ...], tuple[int, ...]]] = {
         (29, 30, 31, 64, 65, 66, 220, 68, 69, 70, 71, 240, 241),
         (194, 196, 195, 190, 193, 191, 192, 186, 189, 188, 187, 180, 181),
     ),
+    # acct, settimeofday, clock_settime, adjtimex, clock_adjtime, reboot, sethostname, setdomainname, swapon, swapoff,
+    # init_module, finit_module, delete_module, kexec_load, kexec_file_load, quotactl, syslog, vhangup, iopl, ioperm,
+    # open_by_handle_at (which asks for no path, and so for no rule of Landlock)
+    "the machine": (
+        (163, 164, 227, 159, 305, 169, 170, 171, 167, 168, 175, 313, 176, 246, 320, 179, 103, 153, 172, 173, 304),
+        (89, 170, 112, 171, 266, 142, 161, 162, 224, 225, 105, 273, 106, 104, 294, 60, 116, 58, 265),
+    ),
     # add_key, request_key, keyctl
     "keyrings": ((248, 249, 250), (217, 218, 219)),
     # unshare, setns, mount, umount2, pivot_root, chroot, open_tree, move_mount, fsopen, fsmount, mount_setattr, bpf,
@@ -73,8 +89,10 @@ _REFUSED: dict[str, tuple[tuple[int, ...], tuple[int, ...]]] = {
         (97, 268, 40, 39, 41, 51, 428, 429, 430, 432, 442, 280, 282),
     ),
 }
-#: clone, clone3, prlimit64.
-_ASKED = ((56, 435, 302), (220, 435, 261))
+#: clone, clone3, prlimit64, ioctl.
+_ASKED = ((56, 435, 302, 16), (220, 435, 261, 29))
+#: What is not asked of a device or file: TIOCSTI, TIOCLINUX, FS_IOC_SETFLAGS (of 32 bits, too), FS_IOC_FSSETXATTR.
+_IOCTLS = (0x5412, 0x541C, 0x40086602, 0x40046602, 0x401C5820)
 #: Machine → (its number in audit.h, its place in the rows above).
 _MACHINES = {"x86_64": (0xC000003E, 0), "aarch64": (0xC00000B7, 1)}
 _THREAD = 0x10000  # CLONE_THREAD
@@ -82,6 +100,10 @@ _NO_SUCH_CALL = 38  # ENOSYS, at which the C library asks for clone in the place
 _X32 = 0x40000000  # the calls of x86-64's other numbering begin here
 _PERMISSION = 1  # EPERM
 _ALLOW, _ERROR = 0x7FFF0000, 0x00050000  # SECCOMP_RET_ALLOW, SECCOMP_RET_ERRNO
+
+
+#: What this process may read, since it was confined.
+_readable: list[str] = []
 
 
 def landlock_version() -> int:
@@ -93,14 +115,21 @@ def landlock_version() -> int:
 
 
 def in_force() -> dict[str, bool]:
-    """What of a child is confined on this machine: ``writing``, ``network``, ``memory``, ``processor``."""
-    version, linux = landlock_version(), sys.platform == "linux"
+    """Which parts of a child's confinement this machine has, by their names."""
+    landlock, linux = landlock_version() >= 1, sys.platform == "linux"
     return {
-        "writing": version >= 1,
-        "network": version >= 4 or (linux and os.uname().machine in _MACHINES),
+        "reading": landlock,
+        "writing": landlock,
+        "network": linux and _has_filters(),
         "memory": linux,
         "processor": sys.platform != "win32",
     }
+
+
+def _has_filters() -> bool:
+    """Whether the kernel takes a seccomp filter: it finds fault with none at all, but not with being asked."""
+    refused = _libc().prctl(_SET_SECCOMP, _FILTER, None, 0, 0) != 0 and ctypes.get_errno() == errno.EFAULT
+    return refused and os.uname().machine in _MACHINES
 
 
 def begin(scratch: str, parent: int) -> None:
@@ -119,17 +148,27 @@ def end_with(parent: int) -> None:
 
 
 def confine(scratch: str | None, *, starts: bool = False) -> None:
-    """Give up everything but reading, computing, and writing below ``scratch``; what a kernel lacks is left out.
+    """Give up everything but computing, reading what ``READABLE`` lists, and writing below ``scratch``.
 
-    ``starts``: it starts programs, and refuses system calls for each of them (``refuse_calls``), not for itself.
+    What a kernel lacks is left out. ``starts``: it starts programs, each of which is to give up the rest
+    (``confine_started``). Raises OSError where the kernel has a part and refuses it.
     """
+    _readable[:] = [place for place in os.environ.pop(READABLE, "").split("\n") if place]
     limit()
     if sys.platform != "linux":
         return
     _libc().prctl(_SET_NO_NEW_PRIVS, 1, 0, 0, 0)
-    _landlock(scratch)
+    _landlock(scratch, [*_readable, "/proc" if starts else "/proc/self"])
+    _drop_capabilities()
     if not starts:
         refuse_calls()
+
+
+def confine_started(scratch: str, *, starts: bool) -> None:
+    """What a process of one that ``starts`` gives up besides: others' /proc, system calls. Raises OSError."""
+    if sys.platform == "linux":
+        _landlock(scratch, [*_readable, "/proc/self"])
+    refuse_calls(starts=starts)
 
 
 def limit() -> None:
@@ -152,44 +191,68 @@ def _libc() -> ctypes.CDLL:
     return ctypes.CDLL(None, use_errno=True)
 
 
-def _landlock(scratch: str | None) -> None:
+def _landlock(scratch: str | None, readable: Sequence[str]) -> None:
     version = landlock_version()
     if version < 1:
         return
-    rights = _WRITE_FILE | _REMOVE_DIR | _REMOVE_FILE | _MAKE
-    rights |= (_REFER if version >= 2 else 0) | (_TRUNCATE if version >= 3 else 0)
+    reads, writes = _READ_FILE | _READ_DIR, _WRITE_FILE | _REMOVE_DIR | _REMOVE_FILE | _MAKE
+    writes |= (_REFER if version >= 2 else 0) | (_TRUNCATE if version >= 3 else 0)
+    handled = reads | writes | (_IOCTL if version >= 5 else 0)
     # handled_access_fs, then as the kernel knows them handled_access_net, scoped
-    attributes = struct.pack("<QQQ", rights, _TCP if version >= 4 else 0, _SCOPES if version >= 6 else 0)
+    attributes = struct.pack("<QQQ", handled, _TCP if version >= 4 else 0, _SCOPES if version >= 6 else 0)
     size = 8 if version < 4 else 16 if version < 6 else 24
     libc = _libc()
-    rules = libc.syscall(_CREATE, attributes, ctypes.c_size_t(size), ctypes.c_uint32(0))
-    if rules < 0:
-        return
+    rules = _must(libc.syscall(_CREATE, attributes, ctypes.c_size_t(size), ctypes.c_uint32(0)))
     try:
-        places = [("/dev/null", rights & (_WRITE_FILE | _TRUNCATE))]
+        places = [("/dev/null", _READ_FILE | writes & (_WRITE_FILE | _TRUNCATE))]
+        places += [(place, _READ_DIR if place.endswith("/") else reads) for place in readable]
         if scratch is not None:
-            places.append((scratch, rights))
+            places.append((scratch, reads | writes & ~_DEVICES))
         for path, allowed in places:
-            place = os.open(path, os.O_PATH | os.O_CLOEXEC)  # type: ignore[attr-defined,unused-ignore]
             try:
+                place = os.open(path, os.O_PATH | os.O_CLOEXEC)  # type: ignore[attr-defined,unused-ignore]
+            except OSError:  # another system has other places
+                continue
+            try:
+                if not stat.S_ISDIR(os.fstat(place).st_mode):
+                    allowed &= ~_READ_DIR
                 rule = struct.pack("<Qi", allowed, place)
-                libc.syscall(_ADD, ctypes.c_int(rules), ctypes.c_int(_PATH_BENEATH), rule, ctypes.c_uint32(0))
+                _must(libc.syscall(_ADD, ctypes.c_int(rules), ctypes.c_int(_PATH_BENEATH), rule, ctypes.c_uint32(0)))
             finally:
                 os.close(place)
-        libc.syscall(_RESTRICT, ctypes.c_int(rules), ctypes.c_uint32(0))
+        _must(libc.syscall(_RESTRICT, ctypes.c_int(rules), ctypes.c_uint32(0)))
     finally:
         os.close(rules)
+
+
+def _must(result: int) -> int:
+    """The result of a system call that must not fail. Raises OSError."""
+    if result < 0:
+        raise OSError(ctypes.get_errno(), f"this process cannot be confined: {os.strerror(ctypes.get_errno())}")
+    return result
+
+
+def _drop_capabilities() -> None:
+    """Leave root, for good, no more than a user may do who can read all files."""
+    libc = _libc()
+    for number in range(64):  # up to the last that the kernel knows; a user may drop none, and has none
+        if number != _READ_SEARCH and libc.prctl(_DROP_CAPABILITY, number, 0, 0, 0) != 0:
+            break
+    libc.prctl(_AMBIENT, _CLEAR_ALL, 0, 0, 0)
+    head, sets = struct.pack("<Ii", _CAPABILITIES_3, 0), ctypes.create_string_buffer(24)
+    _must(libc.capget(head, sets))
+    held = struct.unpack("<6I", sets.raw)[1] & 1 << _READ_SEARCH
+    _must(libc.capset(head, struct.pack("<2I16x", held, held)))
 
 
 def refuse_calls(*, starts: bool = False) -> None:
     """Refuse the system calls of ``_REFUSED``, and to start processes or to set limits; threads go on.
 
-    ``starts``: a compiler, which may start processes; they give up the same.
+    ``starts``: a compiler, which may start processes; they give up the same. Raises OSError.
     """
-    known = _MACHINES.get(os.uname().machine) if sys.platform == "linux" else None
-    if known is None:
+    if sys.platform != "linux" or not _has_filters():
         return
-    machine, column = known
+    machine, column = _MACHINES[os.uname().machine]
     refused = [n for what, row in _REFUSED.items() if not (starts and what == "processes") for n in row[column]]
     program = _program(machine, refused, _ASKED[column], starts=starts)
     _libc().prctl(_SET_NO_NEW_PRIVS, 1, 0, 0, 0)  # without which only root may
@@ -199,7 +262,7 @@ def refuse_calls(*, starts: bool = False) -> None:
         _fields_ = (("length", ctypes.c_ushort), ("steps", ctypes.c_void_p))
 
     whole = Program(len(program) // _STEP.size, ctypes.cast(steps, ctypes.c_void_p))
-    _libc().prctl(_SET_SECCOMP, _FILTER, ctypes.byref(whole), 0, 0)
+    _must(_libc().prctl(_SET_SECCOMP, _FILTER, ctypes.byref(whole), 0, 0))
 
 
 #: sock_filter of linux/filter.h: the instruction, how many steps to jump where it is so and where not, the operand.
@@ -208,9 +271,9 @@ _Step = tuple[int, int | str, int | str, int]
 _LOAD, _IF_EQUAL, _IF_LEAST, _IF_ANY, _ANSWER = 0x20, 0x15, 0x35, 0x45, 0x06
 
 
-def _program(machine: int, refused: Sequence[int], asked: tuple[int, int, int], *, starts: bool) -> bytes:
+def _program(machine: int, refused: Sequence[int], asked: tuple[int, int, int, int], *, starts: bool) -> bytes:
     """The filter: seccomp_data has the call's number at 0, the machine at 4, its arguments from 16 on, 8 bytes each."""
-    clone, clone3, prlimit = asked
+    clone, clone3, prlimit, ioctl = asked
     end: list[tuple[str, _Step]] = [  # what the jumps lead to, by name
         ("clone", (_LOAD, 0, 0, 16)),
         ("", (_IF_ANY, "allow", "refuse", _THREAD)),
@@ -218,6 +281,9 @@ def _program(machine: int, refused: Sequence[int], asked: tuple[int, int, int], 
         ("", (_IF_EQUAL, 0, "refuse", 0)),
         ("", (_LOAD, 0, 0, 36)),
         ("", (_IF_EQUAL, "allow", "refuse", 0)),
+        ("ioctl", (_LOAD, 0, 0, 24)),
+        *(("", (_IF_EQUAL, "refuse", 0, request)) for request in _IOCTLS),
+        ("", (_IF_EQUAL, "allow", "allow", 0)),
         ("absent", (_ANSWER, 0, 0, _ERROR | _NO_SUCH_CALL)),
         ("allow", (_ANSWER, 0, 0, _ALLOW)),
         ("refuse", (_ANSWER, 0, 0, _ERROR | _PERMISSION)),
@@ -230,6 +296,7 @@ def _program(machine: int, refused: Sequence[int], asked: tuple[int, int, int], 
         *(("", (_IF_EQUAL, "refuse", 0, call)) for call in refused),
         ("", (_IF_EQUAL, "allow" if starts else "clone", 0, clone)),
         ("", (_IF_EQUAL, "absent", 0, clone3)),
+        ("", (_IF_EQUAL, "ioctl", 0, ioctl)),
         ("", (_IF_EQUAL, "prlimit", "allow", prlimit)),
     ]
     steps = [*start, *end]

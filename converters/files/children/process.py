@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
+import shutil
+import signal
 import subprocess
+import sys
 import tempfile
 import threading
 import time
@@ -15,11 +19,13 @@ from typing import IO, Any, BinaryIO, cast
 
 import numpy as np
 
+from converters.files.children.confinement import in_force
+from converters.files.children.environment import child_environment, readable_places
 from converters.files.children.frames import FramingError, Tensors, read_frame, write_frame
 from converters.files.children.memory_limits import Memory
 from converters.files.children.python import confined_command
 from converters.files.children.time_limits import processor_time, time_limit
-from converters.files.folders import OwnFolder, scratch_folder, size_of
+from converters.files.folders import OwnFolder, link_model, live_folders, scratch_folder, size_of
 from signatures.errors import ExportModelError, RuntimeUnavailableError
 
 #: Seconds that one request may take: importing TensorFlow on a loaded machine is the slowest of them.
@@ -27,39 +33,56 @@ TIMEOUT = 300.0
 #: Seconds after which it is looked at again whether one has taken too long.
 _LOOK = 1.0
 
+#: In the place of what a program said that anyone may have made.
+_UNSAID = "what it said is not repeated (-v prints it)"
+#: Where in its folder a process writes; beside it lies what it is handed, to be read alone.
+_WRITES = "own"
 #: Bytes that several runs are fed in one request: answers are held until the last of them, and one that takes longer
 #: than ``TIMEOUT`` is taken for dead.
 _REQUEST = 4 << 20
-
-#: Of numpy's matrix products: what they give does not depend on the machine's processors, and many sources are
-#: exported by a process for each of these.
-_ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1"}
 
 
 class RunFailedError(ExportModelError):
     """A runtime refused a model or failed while running it. This is what verification reports, not a crash of it."""
 
     exit_status = 1
+    #: The words of a program that anyone may have made, for who asks for them: no message repeats them.
+    said = ""
 
 
 class RuntimeProcess(AbstractContextManager["RuntimeProcess"]):
     """A child process that speaks frames. Started on first use, fed many models, ended by ``close``."""
 
     def __init__(
-        self, name: str, command: Sequence[str], *, confined: bool = True, timed_out: set[str] | None = None
+        self,
+        name: str,
+        command: Sequence[str],
+        *,
+        confined: bool = True,
+        browser: bool = False,
+        own_words: str | None = None,
+        timed_out: set[str] | None = None,
     ) -> None:
-        """``confined``: it may not write outside a folder of its own, nor reach a network (confinement.py).
+        """A process that is not started yet.
+
+        ``confined``: it may not read or write outside of its places, nor reach a network (confinement.py); else it
+        gives that up by itself, or is a ``browser`` and gives up nothing.
+
+        ``own_words``: it runs source code, and of what is said then only what this pattern matches is repeated.
 
         ``timed_out``: files that this or another runtime was stopped with, which are not loaded again; one that has no
         end before its first answer is added. None where the models are trusted, or slow by themselves (Keras).
         """
         self.name = name
         self.command = list(command)
-        self.confined = confined
+        self.confined, self.browser = confined, browser
+        self._own_words = own_words
         self.version: str | None = None
         self._process: subprocess.Popen[bytes] | None = None
         self._errors: IO[bytes] | None = None
         self._scratch: OwnFolder | None = None
+        #: folders that it can read, of those that this process has; None where it reads all that the user can
+        self._open: tuple[Path, ...] | None = None
         #: it has been asked and has not answered
         self._busy = False
         #: when it was asked
@@ -80,16 +103,19 @@ class RuntimeProcess(AbstractContextManager["RuntimeProcess"]):
             return
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  it lives as long as the process
         self._scratch = scratch_folder()
-        # What is not confined (a browser) has its own folders where the user's are, and sweeps them by itself.
-        places = dict.fromkeys(("TMPDIR", "TMP", "TEMP"), str(self._scratch.path)) if self.confined else {}
+        own = self._scratch.path / _WRITES
+        own.mkdir()
+        # A browser has its own folders where the user's are, and sweeps them by itself.
+        self._open = None if self.browser or not in_force()["reading"] else live_folders()
+        readable = () if self._open is None else (*readable_places(self.command), *map(str, self._open))
         try:
-            command = confined_command(self.command, str(self._scratch.path)) if self.confined else self.command
             self._process = subprocess.Popen(
-                command,
+                confined_command(self.command, str(own)) if self.confined else self.command,
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=self._errors,
-                env={**os.environ, **_ONE_THREAD, **places},
+                env=child_environment(None if self.browser else own, readable),
+                start_new_session=True,  # no terminal is its own, to read from or to type into
             )
         except OSError as error:
             self.close()
@@ -139,12 +165,26 @@ class RuntimeProcess(AbstractContextManager["RuntimeProcess"]):
             memory.allow(size)
         try:
             with contextlib.nullcontext() if answered else self.first(path, size):
-                self.request({"cmd": "load", "id": identity, "path": path, **options})
+                self.request({"cmd": "load", "id": identity, "path": self._hand_over(path, identity), **options})
         except RunFailedError:
-            if memory is not None:
-                memory.release(size)
+            self._take_back(identity, size)
             raise
         return LoadedModel(self, identity, size, path, answered=answered)
+
+    def _hand_over(self, path: str, identity: str) -> str:
+        """A path by which the process can read a model, and what lies beside that under its name."""
+        place = Path(path).absolute()
+        if self._open is None or self._scratch is None or not place.exists():
+            return path
+        if any(place.resolve().is_relative_to(folder.resolve()) for folder in self._open):
+            return path
+        return str(link_model(place, self._scratch.path / identity))
+
+    def _take_back(self, identity: str, size: int) -> None:
+        if self._memory is not None:
+            self._memory.release(size)
+        if self._scratch is not None:
+            shutil.rmtree(self._scratch.path / identity, ignore_errors=True)
 
     @contextlib.contextmanager
     def first(self, path: str, size: int) -> Iterator[None]:
@@ -160,8 +200,7 @@ class RuntimeProcess(AbstractContextManager["RuntimeProcess"]):
     def unload(self, identity: str, size: int) -> None:
         """Free a model of that many bytes."""
         self.request({"cmd": "unload", "id": identity})
-        if self._memory is not None:
-            self._memory.release(size)
+        self._take_back(identity, size)
 
     def request(
         self, header: Mapping[str, Any], tensors: Mapping[str, np.ndarray] | None = None
@@ -202,16 +241,25 @@ class RuntimeProcess(AbstractContextManager["RuntimeProcess"]):
                     why=f"to load this file, or answer its first input, {self._first[2]:.0f} s of computing are enough",
                     fix="the file may loop for ever; no other runtime is given it",
                 ) from error
-            raise RunFailedError(
+            raise self._failure(
                 f"{self.name} ended while it was working (status {status})",
-                why=said or (str(error) if isinstance(error, FramingError) else "it printed nothing"),
-                fix="a native runtime aborts on some malformed graphs; the model is not safe to use there",
+                said or (str(error) if isinstance(error, FramingError) else "it printed nothing"),
+                "a native runtime aborts on some malformed graphs; the model is not safe to use there",
             ) from error
         if answer.get("broken"):  # a WebAssembly trap: the heap is not to be trusted any more
             self.close()
         if not answer.get("ok"):
-            raise RunFailedError(f"{self.name} failed", why=str(answer.get("error", "no message")))
+            raise self._failure(f"{self.name} failed", str(answer.get("error", "no message")))
         return answer, results
+
+    def _failure(self, what: str, said: str, fix: str | None = None) -> RunFailedError:
+        """What went wrong, in the runtime's words; a program's own are kept apart (``own_words``)."""
+        if self._own_words is None or not self._loaded:
+            return RunFailedError(what, why=said, fix=fix)
+        known = re.match(self._own_words, said)
+        error = RunFailedError(what, why=_UNSAID if known is None else known.group(), fix=fix)
+        error.said = "\n".join(dict.fromkeys((said, self._last_errors())))
+        return error
 
     def _watch(self, process: subprocess.Popen[bytes], closed: threading.Event) -> None:
         """End a process whose answer takes too long. One thread for all requests: there are dozens for each policy."""
@@ -221,10 +269,10 @@ class RuntimeProcess(AbstractContextManager["RuntimeProcess"]):
             first, timed_out = self._first, self._timed_out
             if first is not None and timed_out is not None and (processor_time(process.pid) or 0) > first[1]:
                 timed_out.add(first[0])
-                process.kill()
+                _end(process, kill=True)
                 return
             if time.monotonic() - self._asked > TIMEOUT:
-                process.kill()
+                _end(process, kill=True)
                 return
 
     def _last_errors(self) -> str:
@@ -248,10 +296,10 @@ class RuntimeProcess(AbstractContextManager["RuntimeProcess"]):
         self._process, self.version, self._busy = None, None, False
         if process is not None:
             if not ready:
-                process.terminate()  # not kill: one that has started a browser ends that first
+                _end(process, kill=False)  # one that has started a browser ends that first
             if process.stdout is not None:
                 process.stdout.close()
-            _wait_or_kill(process, 10 if self.confined else 60)  # what is not confined has a browser to end
+            _wait_or_kill(process, 60 if self.browser else 10)
         if self._errors is not None:
             self._errors.close()
             self._errors = None
@@ -284,8 +332,17 @@ def _wait_or_kill(process: subprocess.Popen[bytes], patience: float = 5) -> int:
     try:
         return process.wait(patience)
     except subprocess.TimeoutExpired:  # it closed its stdout, or speaks no frames any more
-        process.kill()
+        _end(process, kill=True)
         return process.wait()
+
+
+def _end(process: subprocess.Popen[bytes], *, kill: bool) -> None:
+    """Tell a process, and what it has started, to end; ``kill``: it is not asked. No terminal's signal reaches them."""
+    if sys.platform == "win32":
+        process.terminate()
+    elif process.poll() is None:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL if kill else signal.SIGTERM)
 
 
 class LoadedModel(AbstractContextManager["LoadedModel"]):
@@ -344,9 +401,8 @@ class LoadedModel(AbstractContextManager["LoadedModel"]):
                 runs.append({**header, "feeds": {name: keys[id(array)] for name, array in feeds.items()}})
             _, results = self._request({"cmd": "runs", "id": self._identity, "runs": runs}, tensors)
             answers: list[Tensors] = [{} for _ in runs]
-            for key, array in results.items():
-                number, _, name = key.partition("/")
-                answers[int(number)][name] = array
+            for number, answer in enumerate(answers):
+                answer |= {name: results[key] for name in fetch if (key := f"{number}/{name}") in results}
             found += [self._require_outputs(each, fetch) for each in answers]
         return found
 

@@ -24,7 +24,8 @@ from converters.policy.facts import SourceFacts
 from signatures.errors import NotAPolicyError, SourceError, UsageError
 
 NAME = "policy"
-_GRAPH, _VALUES = "graph.pb", "values.npz"
+#: The values go by the graph's name: whoever is handed that is handed them, too.
+_GRAPH, _VALUES = "graph.pb", "graph.pb.npz"
 
 
 class SessionValues:
@@ -67,7 +68,7 @@ def read_session(tensorflow: Any, session: Any, folder: Path) -> SourceModel:
     frozen, notes = policy_nodes(freeze(TrainingGraph(graph, places), SessionValues(values)).graph)
     (folder / _GRAPH).write_bytes(data)
     np.savez(folder / _VALUES, *values.values())
-    options = {"kind": "values", "archive": str(folder / _VALUES), "names": list(values)}
+    options = {"kind": "values", "names": list(values)}
     original = OriginalRun("tensorflow", folder / _GRAPH, options)
     return SourceModel(frozen, (), SourceFacts(notes=notes), NAME, original)
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from converters.files.fetch import Fetched
 from converters.formats.onnx.reader import read_onnx
 from converters.formats.onnx.trainers import understand
+from converters.formats.onnx.vetted import safe_copy
 from converters.formats.source import OriginalRun, ReadOptions, SourceModel
 
 
@@ -15,6 +18,7 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
     """
     model = read_onnx(given)
     graph, facts = understand(model)
-    original = OriginalRun("onnxruntime", given.path, {"lift": list(model.draws)})
+    copy = partial(safe_copy, given.path, []) if len(model.files) > 1 else None
+    original = OriginalRun("onnxruntime", given.path, {"lift": list(model.draws)}, copy=copy)
     producer = f"{model.producer}, opset {model.opset}" if model.producer else f"opset {model.opset}"
     return [SourceModel(graph, model.files, facts, original=original, producer=producer)]

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 import shutil
-from functools import partial
 
 from converters.files.children.python import child_command
-from converters.runtimes.base import Runtime, RuntimeInfo
+from converters.runtimes.base import OWN_WORDS, Runtime, RuntimeInfo
+from signatures.errors import RuntimeUnavailableError
 
 #: In the order in which they are looked for.
 COMPILERS = ("gcc", "clang")
@@ -24,5 +24,12 @@ def _find() -> RuntimeInfo:
     return RuntimeInfo("c", here is not None, None, _HOW, supported=os.name == "posix")
 
 
-#: Its child gives up the network, and writing outside a folder, by itself: the compiler is a process that it starts.
-RUNTIMES = (Runtime("c", _find, partial(child_command, "converters.runtimes.c.child"), confined=False),)
+def _command() -> list[str]:
+    program = compiler()
+    if program is None:
+        raise RuntimeUnavailableError("no C compiler is installed", fix=_HOW)
+    return child_command("converters.runtimes.c.child", program)
+
+
+#: Its child confines itself: the compiler is a process that it starts.
+RUNTIMES = (Runtime("c", _find, _command, confined=False, own_words=OWN_WORDS),)

@@ -12,7 +12,6 @@ import os
 import resource
 import shutil
 import sys
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -26,7 +25,7 @@ from converters.files.children.frames import Tensors
 from converters.formats.programs.artifact import contract_held
 from converters.formats.programs.members import Header, header_of
 from converters.formats.programs.weights import weights_name
-from converters.runtimes.c import compiler
+from converters.runtimes.base import REFUSED
 from converters.runtimes.rows import as_declared, fed_rows, row_count
 from signatures.code import CodeOptions
 from signatures.errors import ExportModelError
@@ -114,7 +113,7 @@ class _Builder:
         self.asked.flush()
         answer = json.loads(self.answers.readline())
         if answer["rc"]:
-            raise CompileError(answer["said"][:2000])
+            raise CompileError(f"{REFUSED}:\n{answer['said'][:2000]}")
         return file.with_suffix(".so")
 
 
@@ -136,21 +135,15 @@ def _compile(program: str, folder: Path, asked: BinaryIO, answers: BinaryIO) -> 
 
 def main() -> None:
     """Entry of the child process."""
-    program = compiler()
-    assert program is not None
-    folder = Path(tempfile.mkdtemp(prefix="export-model-c-"))
-    os.environ["TMPDIR"] = str(folder)
+    (program,) = sys.argv[1:]
+    folder = Path(os.environ["TMPDIR"])
     (ask_out, ask_in), (answer_out, answer_in) = os.pipe(), os.pipe()
     if os.fork() == 0:
         for end in (ask_in, answer_out, 0, 1):
             os.close(end)
         os.dup(os.open(os.devnull, os.O_RDWR))
-        if (worker := os.fork()) == 0:
-            confinement.confine(str(folder), starts=True)
-            _compile(program, folder, os.fdopen(ask_out, "rb"), os.fdopen(answer_in, "wb"))
-            os._exit(0)
-        os.waitpid(worker, 0)  # it ends when nobody asks any more; it may not remove its own folder
-        shutil.rmtree(folder, ignore_errors=True)
+        confinement.confine(str(folder), starts=True)
+        _compile(program, folder, os.fdopen(ask_out, "rb"), os.fdopen(answer_in, "wb"))
         os._exit(0)
     os.close(ask_out)
     os.close(answer_in)

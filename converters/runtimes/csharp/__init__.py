@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 import shutil
-from functools import partial
 
 from converters.files.children.python import child_command
-from converters.runtimes.base import Runtime, RuntimeInfo
+from converters.runtimes.base import OWN_WORDS, Runtime, RuntimeInfo
+from signatures.errors import RuntimeUnavailableError
 
 _HOW = "sudo apt-get install mono-mcs mono-runtime" if os.name == "posix" else "mono on Linux or macOS"
 
@@ -23,13 +23,12 @@ def _find() -> RuntimeInfo:
     return RuntimeInfo("csharp", here, None, _HOW, supported=os.name == "posix")
 
 
-#: Its child gives up the network, and writing outside a folder, by itself: it starts the compiler and Mono.
-RUNTIMES = (
-    Runtime(
-        "csharp",
-        _find,
-        partial(child_command, "converters.runtimes.csharp.child"),
-        products_per_second=2e8,
-        confined=False,
-    ),
-)
+def _command() -> list[str]:
+    here = tools()
+    if here is None:
+        raise RuntimeUnavailableError("Mono is not installed", fix=_HOW)
+    return child_command("converters.runtimes.csharp.child", *here)
+
+
+#: Its child confines itself: it starts the compiler and Mono.
+RUNTIMES = (Runtime("csharp", _find, _command, products_per_second=2e8, confined=False, own_words=OWN_WORDS),)

@@ -24,7 +24,7 @@ from converters.files.children.frames import Tensors
 from converters.formats.programs.artifact import contract_held
 from converters.formats.programs.members import Field, Header, header_of
 from converters.formats.programs.weights import weights_name
-from converters.runtimes.csharp import tools
+from converters.runtimes.base import REFUSED
 from converters.runtimes.rows import as_declared, fed_rows, row_count
 from signatures.code import CodeOptions
 from signatures.errors import ExportModelError
@@ -113,12 +113,12 @@ class _Program:
             _SECONDS + int(size * _SECONDS_PER_BYTE),
         )
         if done.returncode:
-            raise CompileError((done.stdout + done.stderr)[:2000])
+            raise CompileError(f"{REFUSED}:\n{(done.stdout + done.stderr)[:2000]}")
         self.process = subprocess.Popen(  # one thread, so nothing can hold a lock across the fork
             [mono, str(own / "policy.exe"), str(seed), str(own / "weights.bin")],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            preexec_fn=bounds(_BYTES + size * _BYTES_PER_BYTE, _RUN_SECONDS, starts=False),
+            preexec_fn=bounds(own, _BYTES + size * _BYTES_PER_BYTE, _RUN_SECONDS, starts=False),
         )
         self._skip()
         if wrong := int(np.frombuffer(self._read(4), "<i4")[0]):
@@ -171,24 +171,16 @@ class _Program:
 
 def main() -> None:
     """Entry of the child process."""
-    here = tools()
-    assert here is not None
-    folder = Path(tempfile.mkdtemp(prefix="export-model-csharp-"))
-    read, write = os.pipe()
-    if os.fork() == 0:  # it removes the folder when this one has ended, however it does
-        os.close(write)
-        os.read(read, 1)
-        shutil.rmtree(folder, ignore_errors=True)
-        os._exit(0)
-    os.close(read)
-    os.environ |= {"TMPDIR": str(folder), "HOME": str(folder), "MONO_DISABLE_SHARED_AREA": "1"}
+    compiler, mono = sys.argv[1:]
+    folder = Path(os.environ["TMPDIR"])
+    os.environ["MONO_DISABLE_SHARED_AREA"] = "1"
     confinement.confine(str(folder), starts=True)
     out = claim_stdout()
 
     def load(header: Mapping[str, Any]) -> Model:
         seed = header.get("seed")
         seed = int.from_bytes(os.urandom(8), "little") if seed is None else seed
-        return _Program(Path(header["path"]), seed, folder, *here)
+        return _Program(Path(header["path"]), seed, folder, compiler, mono)
 
     serve("csharp", "mono", load, (CompileError, ExportModelError), out)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from converters.runtimes.base import Runtime, RuntimeInfo
+from converters.runtimes.base import OWN_WORDS, Runtime, RuntimeInfo
 from converters.runtimes.javascript.node import INSTALL_NODE, node_command, node_executable
 
 _RUNNER = Path(__file__).resolve().with_name("runner.mjs")
@@ -18,4 +18,4 @@ def _command() -> list[str]:
     return node_command(_RUNNER)
 
 
-RUNTIMES = (Runtime("node", _find, _command, products_per_second=2e8),)
+RUNTIMES = (Runtime("node", _find, _command, products_per_second=2e8, own_words=OWN_WORDS),)

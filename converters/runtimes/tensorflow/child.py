@@ -1,7 +1,7 @@
 """TensorFlow in its own process: graphs in a Session, SavedModels through a signature.
 
 What a model is loaded from, by ``kind``: ``graph`` (a frozen GraphDef), ``values`` (the training graph of a session of
-the user's, its variables' values in the numpy archive ``archive``, in the order of ``names``), ``function`` (a
+the user's, its variables' values in the numpy archive beside it, in the order of ``names``), ``function`` (a
 SavedModel of TensorFlow 2 or a Keras model, as TensorFlow itself freezes it), ``saved_model`` (a SavedModel called by
 ``signature``), ``keras`` (a Keras model of Keras' own layers, which is not run but given back as bytes: its GraphDef as
 ``graph``, a JSON object of its inputs' and outputs' tensors as ``names``).
@@ -71,10 +71,10 @@ def main() -> None:
     def load_frozen(path: str, *, source: bool) -> InSession:
         return InSession(import_graph(tf.compat.v1.GraphDef.FromString(Path(path).read_bytes())), source=source)
 
-    def load_with_values(path: str, archive: str, names: Sequence[str]) -> InSession:
+    def load_with_values(path: str, names: Sequence[str]) -> InSession:
         """A training graph with values that were read from a session; variables are told by their nodes' names."""
         model = load_frozen(path, source=True)
-        with np.load(archive, allow_pickle=False) as kept:
+        with np.load(f"{path}.npz", allow_pickle=False) as kept:
             values = {name: kept[f"arr_{i}"] for i, name in enumerate(names)}
         graph = model.session.graph
         with graph.as_default():
@@ -102,7 +102,7 @@ def main() -> None:
         if kind == "saved_model":
             return Saved(path, header.get("signature", "serving_default"))
         if kind == "values":
-            return load_with_values(path, header["archive"], header["names"])
+            return load_with_values(path, header["names"])
         if kind == "keras":
             from converters.formats.keras.config import config_inside, refuse_code
 
