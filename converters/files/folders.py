@@ -68,11 +68,16 @@ class OwnFolder:
 
 def scratch_folder() -> OwnFolder:
     """A folder for temporary files. Raises OSError."""
+    sweep_scratch()
+    return OwnFolder(Path(tempfile.gettempdir()), _SCRATCH)
+
+
+def sweep_scratch() -> None:
+    """Remove the folders for temporary files that killed runs have left; every run does so, once."""
     place = Path(tempfile.gettempdir())
-    if place not in _swept:  # once: it may hold a great many files of others
+    if place not in _swept:  # it may hold a great many files of others
         _swept.add(place)
         sweep(place, _SCRATCH)
-    return OwnFolder(place, _SCRATCH)
 
 
 def live_folders() -> tuple[Path, ...]:

@@ -11,6 +11,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 #: Seconds in which a command that was told to stop does so by itself.
 _GRACE = 3
@@ -27,6 +28,9 @@ def main(args: Sequence[str] | None = None) -> None:
                 if told:
                     _clean_up()
                 raise
+            finally:
+                if (folders := _folders()) is not None:
+                    folders.sweep_scratch()
     except BaseException as error:
         # Whatever an interrupt was turned into on its way (an import that failed, say): it is what happened.
         if not told and not isinstance(error, KeyboardInterrupt):
@@ -70,9 +74,12 @@ def _stoppable(told: list[int]) -> Iterator[None]:
 
 def _clean_up() -> None:
     """Remove the folders of this process, if it came as far as to make any."""
-    folders = sys.modules.get("converters.files.folders")
-    if folders is not None:
+    if (folders := _folders()) is not None:
         folders.remove_all()
+
+
+def _folders() -> Any:
+    return sys.modules.get("converters.files.folders")
 
 
 def _use_one_thread() -> None:

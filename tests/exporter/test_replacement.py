@@ -250,6 +250,16 @@ def test_what_a_killed_run_left_is_removed_by_the_next_and_what_lives_is_not(out
     assert not [p for p in (left, unmarked, torn, new) if p.exists()]
 
 
+def test_a_run_that_makes_no_temporary_folder_removes_those_of_killed_ones(tmp_path: Path) -> None:
+    left = tmp_path / f"export-model-{'a' * 16}"
+    left.mkdir()
+    (left / folders.MARKER).write_bytes(folders.OURS)
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+    ran = python("-m", "exporter", "inspect", fixture("continuous"), environment=environment)
+    assert ran.status == 0, ran.err
+    assert not left.exists()
+
+
 @pytest.mark.runtimes
 @pytest.mark.parametrize("locks", [True, False])
 def test_without_locks_a_folder_is_swept_a_day_later(locks: bool, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
