@@ -127,6 +127,7 @@ Q_NAMES = re.compile(
 #: … and the value of a state, one number a row (CleanRL, rsl_rl, Stable-Baselines3, RLlib).
 STATE_VALUE_NAMES = re.compile(
     r"v|vf|values?|value_estimate|v_?values?|state_?values?|critic|baseline|value_?(net(work)?|head|func(tion)?|outputs?)"
+    r"|critic_?(net(work)?|head|values?|outputs?)|(value|vf)_?pred(iction)?s?"
 )
 
 #: What the action is called: alone, or (hybrid policies, torch exports) by its kind.

@@ -123,10 +123,17 @@ def says_action(name: str) -> bool:
 
 
 def is_state_value(given: Candidate) -> bool:
-    """Whether an output of one number a row is called a value (of a state, or of a given action)."""
+    """Whether an output of one number a row is called a value (of a state, or of a given action), or its weights are.
+
+    An actor's layer may be called so in part (``actor_critic.actor``): the output's name or the layer's decides then.
+    """
     name, model = plain_name(given.name), plain_name(given.model)
     named = STATE_VALUE_NAMES.fullmatch(name) or Q_NAMES.fullmatch(name)
-    return bool(named or _STATE_NETWORKS.fullmatch(model))
+    parts = {plain_name(part) for text in given.layer for part in re.split("[./]", text) if len(part) > 1}
+    acts = any(map(_ACTION_NAMES.fullmatch, (name, *parts)))
+    return bool(
+        named or _STATE_NETWORKS.fullmatch(model) or (any(map(STATE_VALUE_NAMES.fullmatch, parts)) and not acts)
+    )
 
 
 def may_be_values(graph: Graph, tensor: str) -> bool:

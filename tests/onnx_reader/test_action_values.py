@@ -140,7 +140,17 @@ def test_the_user_may_say_that_it_is_an_action(given: str, tmp_path: Path) -> No
     assert not signature.notes
 
 
-@pytest.mark.parametrize("name", ["value", "values", "critic", "v", "vf", "state_value", "q"])
+@pytest.mark.parametrize("weights", ["critic.2.weight", "agent.value_net.weight", "vf.weight", "baseline"])
+def test_a_value_network_is_known_by_the_names_of_its_last_layer(weights: str, tmp_path: Path) -> None:
+    """... as torch.onnx.export leaves them; an actor's are not, whatever it is part of."""
+    with pytest.raises(NotAPolicyError, match="is a value"):
+        compiled(network("output", size=1, weights=weights), tmp_path)
+    for name, own in (("action", weights), ("output", f"critic.actor.{weights}"), ("output", "layers.2.weight")):
+        signature = compiled(network(name, size=1, weights=own), tmp_path).signature
+        assert signature.output("action").shape == (None, 1)
+
+
+@pytest.mark.parametrize("name", ["value", "values", "critic", "v", "vf", "state_value", "q", "critic_value"])
 def test_a_value_network_is_not_a_policy(name: str, tmp_path: Path) -> None:
     with pytest.raises(NotAPolicyError, match="is a value") as caught:
         compiled(network(name, size=1), tmp_path)

@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 
 from converters.formats.source import ReadOptions
+from converters.graph.run import run_graph
 from converters.policy.policy import Policy
 from exporter.export.sources import read_source
 from fixtures.goldens import read_npz
-from fixtures.sb3_zip import FOLDER
+from fixtures.sb3_zip import FOLDER, weight
 from fixtures.torch_checkpoint.cases import waves
 from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError, SourceError, UsageError
 from tests.stable_baselines3.saved_models import answered, saved
@@ -63,6 +64,29 @@ def test_gives_what_predict_gives(name: str, tmp_path: Path) -> None:
         assert (name_of in golden) == (name_of in answers)
         if name_of in golden:
             assert answers[name_of] == pytest.approx(golden[name_of], abs=ATOL, rel=RTOL)
+
+
+@pytest.mark.parametrize("name", ["ars_linear", "ars_clipped"])
+def test_a_linear_policy_of_ars_before_its_layer_had_a_number_is_read(name: str, tmp_path: Path) -> None:
+    """sb3-contrib before 1.7: action_net.weight; the answers are those of the same layer as it is kept now."""
+    about = json.loads((FOLDER / f"{name}.json").read_text())
+    writer, path, golden = Writer(), tmp_path / "old.zip", read_npz(FOLDER / f"{name}.npz")
+    state = {k.replace(".0.", "."): weight(k, waves(e["waves"], e["shape"])) for k, e in about["tensors"].items()}
+    entries = {"data": json.dumps(about["data"]).encode(), "policy.pth": writer.zip(writer.state(state))}
+    path.write_bytes(zipped(entries))
+    wanted = golden["deterministic"]
+    found = answered(compiled(path), golden)["deterministic_action"]
+    assert found.reshape(wanted.shape) == pytest.approx(wanted, abs=ATOL, rel=RTOL)
+
+
+def test_the_zoos_linear_policy_of_2022_acts_as_the_library_loads_it() -> None:
+    """The answers are those of sb3-contrib 2.9.2, which loads the file."""
+    path = Path(__file__).resolve().parents[2] / "../shared/corpus4/DLR-RM+rl-trained-agents+CartPole-v1.zip"
+    if not path.exists():
+        pytest.skip(f"{path} is not here")
+    seen = np.random.default_rng(0).normal(size=(8, 4)).astype(np.float32)
+    actions = run_graph(compiled(path).graph, {"state": seen}, ["action"])["action"]
+    assert actions.reshape(-1).tolist() == [1, 1, 0, 0, 1, 1, 0, 0]
 
 
 def test_the_bounds_of_discrete_observations_are_known_column_by_column(tmp_path: Path) -> None:

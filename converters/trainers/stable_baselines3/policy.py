@@ -292,8 +292,11 @@ def _ars_policy(made: _Built, observed: Observed) -> None:
     """``ARSPolicy``, and ``ARSLinearPolicy``, whose default is neither to squash nor to have hidden layers."""
     net = made.net
     x = _features(made, observed, "features_extractor")
-    linear = len(net.state.indices("action_net.")) == 1 and "net_arch" not in made.kwargs
-    out = net.mlp(x, "action_net", made.activation, ends=True, biased="action_net.0.bias" in net.state)
+    if "action_net.weight" in net.state:  # ARSLinearPolicy before sb3-contrib 1.7
+        linear, out = True, net.linear(x, "action_net", biased="action_net.bias" in net.state)
+    else:
+        linear = len(net.state.indices("action_net.")) == 1 and "net_arch" not in made.kwargs
+        out = net.mlp(x, "action_net", made.activation, ends=True, biased="action_net.0.bias" in net.state)
     if made.actions.kind == "Discrete":
         if net.width(out) != made.actions.size:
             raise _mixed_models_error(
