@@ -1,6 +1,6 @@
 """What each target's writer asks of a graph before it encodes it: a named list of steps per target.
 
-``.bytes`` and SavedModel keep what the source has, and have no list. A step takes a graph and says of the same outputs
+``.bytes`` keeps what the source has, and has no list. A step takes a graph and says of the same outputs
 the same, within the rounding of a constant or two.
 """
 
@@ -17,8 +17,14 @@ from converters.compiler.passes.constant_chains import drop_zero_biases, merge_c
 from converters.compiler.passes.fuse import fuse
 from converters.compiler.passes.int8_products import multiply_products
 from converters.compiler.passes.layout_views import transpose_layout_views
-from converters.compiler.passes.lowering import lower_for_importers, lower_for_nn, lower_for_tfjs
+from converters.compiler.passes.lowering import (
+    lower_for_conversion,
+    lower_for_importers,
+    lower_for_nn,
+    lower_for_tfjs,
+)
 from converters.compiler.passes.slice_of_concat import parts_for_slices
+from converters.compiler.passes.unjoined_products import keep_products_unjoined
 from converters.graph.nodes import Graph
 from converters.policy.policy import Policy
 from signatures.roles import Role
@@ -42,6 +48,16 @@ def _on_roots(function: Callable[[Graph, Collection[str]], Graph]) -> Step:
     return lambda graph, outputs: function(graph, outputs.roots)
 
 
+def _on_ends(function: Callable[[Graph, Collection[str]], Graph]) -> Step:
+    """Give a function the outputs, and the nodes that nothing reads: a trainer's constants, which Unity looks up."""
+
+    def step(graph: Graph, outputs: Outputs) -> Graph:
+        readers = graph.consumers()
+        return function(graph, [*outputs.roots, *(n.name for n in graph.nodes if not readers[n.name])])
+
+    return step
+
+
 #: Fewer ops, for runtimes in which the start of an op is most of a small policy's run.
 FEWER_OPS: tuple[Step, ...] = (
     _on_roots(parts_for_slices),
@@ -59,6 +75,8 @@ TFJS_INT8 = (*FEWER_OPS, *_LOWER_FOR_TFJS, _on_roots(multiply_products), _FUSE_A
 ONNX = (*FEWER_OPS, _FUSE, lambda graph, outputs: lower_for_importers(graph))
 LITERT = (*FEWER_OPS, _FUSE, _on_roots(drop_zero_biases))
 PROGRAM = (*FEWER_OPS, _FUSE)
+#: What the official converter makes a TensorFlow.js model of that runs.
+SAVED_MODEL = (_on_ends(lower_for_conversion), _on_ends(keep_products_unjoined))
 #: Models for one consumer stay as they were tried in it: without a Split, whether it reads one or not.
 CONSUMER_ONNX = (_on_roots(transpose_layout_views), _FUSE)
 _UNTRIED = frozenset({"Split"})

@@ -11,6 +11,7 @@ from converters.files.external_data import Detached, is_readable
 from converters.formats.bundle.embed import with_contract
 from converters.formats.format import WriteOptions
 from converters.formats.frozen_graph.encode import encode
+from converters.graph.nodes import Graph
 from converters.policy.policy import Policy
 from signatures.errors import TooLargeError
 
@@ -29,11 +30,16 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
 
 
 def frozen_graph(policy: Policy, contract: str = "{}", weights: Storage = "float32") -> Pieces:
-    """The policy's GraphDef with its contract, made once; without one, as the numpy reference needs it."""
-    made: dict[Any, Pieces] = policy.graph.cache
-    key = frozen_graph, contract, weights
+    """The policy's GraphDef with its contract; without one, as the numpy reference needs it."""
+    return serialised(policy.graph, contract, weights)
+
+
+def serialised(graph: Graph, contract: str, weights: Storage) -> Pieces:
+    """A graph as a GraphDef with the contract, made once."""
+    made: dict[Any, Pieces] = graph.cache
+    key = serialised, contract, weights
     if key not in made:
-        graph = with_contract(store_compactly(policy.graph, weights), contract)
-        detached = Detached.of(graph.values())
-        made[key] = schema.pieces(encode(graph, detached=detached), detached)
+        stored = with_contract(store_compactly(graph, weights), contract)
+        detached = Detached.of(stored.values())
+        made[key] = schema.pieces(encode(stored, detached=detached), detached)
     return made[key]

@@ -8,6 +8,7 @@ from typing import Any
 from msgspec import Struct
 from msgspec.structs import replace
 
+from converters.compiler.passes.unjoined_products import rejoin_biases
 from converters.files.fetch import Fetched, read_bytes
 from converters.files.file_probe import Content
 from converters.formats.bundle.embed import contract_text, facts_of, split_contract
@@ -45,6 +46,8 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
     facts = facts_of(graph, contract)
     if contract is None:
         graph, facts = expose_signature(frozen.graph, frozen.signature, _notes(saved))
+    else:
+        graph = rejoin_biases(graph)
     original = OriginalRun("tensorflow", folder, definition=frozen.definition, detached=saved.detached)
     return [SourceModel(graph, (file, *frozen.files), facts, None if contract is None else contract.name, original)]
 

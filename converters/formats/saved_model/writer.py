@@ -12,13 +12,14 @@ from typing import Any
 import numpy as np
 
 from converters.compiler.passes.weights import store_compactly
+from converters.compiler.targets import SAVED_MODEL, prepare
 from converters.files import tensorflow_messages as schema
 from converters.files.chunks import Pieces
 from converters.files.external_data import Detached, is_readable
 from converters.formats.bundle.embed import with_contract
 from converters.formats.format import WriteOptions
 from converters.formats.frozen_graph.encode import encode
-from converters.formats.frozen_graph.writer import frozen_graph
+from converters.formats.frozen_graph.writer import serialised
 from converters.formats.saved_model.variables import files_of
 from converters.graph.nodes import node_of
 from converters.graph.ops.samplers import SAMPLERS
@@ -62,10 +63,10 @@ def _fill(entries: Any, specs: Iterable[TensorSpec]) -> None:
 def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
     """The SavedModel artefact.
 
-    Its graph is that of the ``.bytes``, put between the other fields as it was serialised; protobuf is given it again
-    where the weights become variables.
+    Its graph is that of the ``.bytes`` unless a converter would misread it, put between the other fields as it was
+    serialised; protobuf is given it again where the weights become variables.
     """
-    graph = frozen_graph(policy, options.contract, options.weights)
+    graph = prepare(policy, SAVED_MODEL)
     about, signed = schema.MetaGraphDef(), schema.MetaGraphDef()
     about.meta_info_def.tags.append("serve")
     for key, (inputs, outputs) in signatures_of(policy).items():
@@ -74,14 +75,18 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
         _fill(definition.inputs, inputs)
         _fill(definition.outputs, outputs)
     version = schema.SavedModel(saved_model_schema_version=1)
-    meta = Pieces(schema.serialise(about), schema.field(2, graph), schema.serialise(signed))
+    meta = Pieces(
+        schema.serialise(about),
+        schema.field(2, serialised(graph, options.contract, options.weights)),
+        schema.serialise(signed),
+    )
     whole = Pieces(schema.serialise(version), schema.field(2, meta))
     if is_readable(whole):
         return {f"{FOLDER}/saved_model.pb": whole}
     detached = Detached()
     about.MergeFrom(signed)
     about.graph_def.CopyFrom(
-        encode(with_contract(store_compactly(policy.graph, options.weights), options.contract), detached=detached)
+        encode(with_contract(store_compactly(graph, options.weights), options.contract), detached=detached)
     )
     version.meta_graphs.append(about)
     files = files_of(version, detached, sha256_hex(options.contract.encode()))

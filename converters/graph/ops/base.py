@@ -148,6 +148,10 @@ class OpDef(_Entry, frozen=True, kw_only=True):
     activation: str = ""
     #: TensorFlow.js computes the activation as a part of a fused product, on every backend (tfjs-core ops/fused_util).
     tfjs_fuses: bool = False
+    #: The layer with which TensorFlow's remapper (2.21) joins it, where TensorFlow.js lacks the kernel: right behind
+    #: the bias, or behind a factor or summand after it (the GELU, the hard swish).
+    remapped: Layer = ""
+    remapped_behind: Layer = ""
     #: The operand whose integers are looked up, and how many rows there are to find.
     looks_up: int | None = None
     table_size: TableSize | None = None

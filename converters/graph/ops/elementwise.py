@@ -278,7 +278,7 @@ UNARY = (
     smooth("Sin", np.sin, loops=simple("sin"), litert=builtin("SIN")),
     smooth("Cos", np.cos, loops=simple("cos"), litert=builtin("COS")),
     smooth("Tan", np.tan, loops=simple("tan"), litert=litert.tan),
-    smooth("Erf", _erf, barracuda=decompositions.ERF, loops=simple("erf"), litert=litert.erf),
+    smooth("Erf", _erf, remapped_behind="dense", barracuda=decompositions.ERF, loops=simple("erf"), litert=litert.erf),
     OpDef(
         "Cast",
         _infer_cast,
