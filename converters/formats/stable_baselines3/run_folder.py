@@ -52,7 +52,7 @@ def statistics_beside(given: Fetched, *, wanted: bool = True) -> tuple[Path | No
     if able and able[0].name in _STATISTICS and (free or callback) and len({*map(given.bytes_of, able)}) == 1:
         return able[0], [file for file in seen if file != able[0]]
     if able and wanted:
-        raise _undecided(able, "beside it" if free else "one folder up")
+        raise _ambiguity_error(able, "beside it" if free else "one folder up")
     return None, seen
 
 
@@ -63,7 +63,7 @@ def _named_after(model: Path) -> Path | None:
     return None if own is None or (own.name in _STATISTICS and own.parent == model.parent) else own
 
 
-def _undecided(files: Sequence[Path], place: str) -> SourceError:
+def _ambiguity_error(files: Sequence[Path], place: str) -> SourceError:
     """The error for statistics at a place of which none is known to be the model's."""
     named = [(file.name, f"--normaliser {path_text(file)}") for file in files[:8]]
     return SourceError(
