@@ -136,6 +136,12 @@ def test_the_channels_of_pettingzoo_that_are_no_colours_are_not_scaled(tmp_path:
 
 
 def test_what_no_script_has_is_not_taken_for_the_nearest(tmp_path: Path) -> None:
+    for name in ("clean_dqn", "clean_pqn"):  # a Sequential that is called network: a classifier's, a policy's
+        path = saved(tmp_path, name)
+        with pytest.raises(SourceError, match=r"networks of any kind(?s:.*)--script cleanrl-dqn"):
+            read_source(path)
+        (policy,) = read_source(path.rename(tmp_path / f"{name}.cleanrl_model")).policies()
+        assert any("read as cleanrl-dqn (its file is a .cleanrl_model)" in note for note in policy.signature.notes)
     path = trunk_of_ones_own(tmp_path)
     with pytest.raises(SourceError, match="no known script has quite the names") as caught:
         read_source(path, ReadOptions(activation="tanh"))

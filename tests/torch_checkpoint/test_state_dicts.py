@@ -27,8 +27,8 @@ ACTIVATIONS = {
     **dict.fromkeys(("ppo_pytorch_continuous", "ppo_pytorch_continuous_2022", "ppo_pytorch_discrete"), "tanh"),
     "rsl_3_1_student": "selu",
 }
-#: Where the names of the layers fit several scripts.
-SCRIPTS = {"clean_ppo": "cleanrl-ppo"}
+#: Where the names of the layers do not tell the script.
+SCRIPTS = {"clean_ppo": "cleanrl-ppo", **dict.fromkeys(("clean_dqn", "clean_pqn"), "cleanrl-dqn")}
 EYE = ((2, 36, 38),)
 
 
@@ -162,7 +162,7 @@ def test_what_the_weights_do_not_tell_is_refused_and_named(tmp_path: Path) -> No
     }
     (tmp_path / "dqn.pt").write_bytes(writer.zip(writer.state(between)))
     with pytest.raises(SourceError, match="nothing stands between"):
-        read_source(tmp_path / "dqn.pt", ReadOptions(activation="relu"))
+        read_source(tmp_path / "dqn.pt", ReadOptions(activation="relu", script="cleanrl-dqn"))
 
 
 def _sequence(*layers: tuple[int, tuple[int, ...]], module: str = "actor_mean") -> dict[str, np.ndarray]:

@@ -50,9 +50,8 @@ def choose_script(saved: Saved, known: Known) -> tuple[Script, str]:
     scripts = _plausible(known)
     if saved.script is not None:
         return _find_script(saved.script, scripts), f"--script {saved.script}"
-    certain = [s for s in scripts if s.activation]
-    why, near = _beside(saved.given.path, certain)
-    if len(near) == 1:
+    why, near = _beside(saved.given.path, [s for s in scripts if s.activation])
+    if len(near) == 1 and (why or near[0].is_told_by_names(known.state)):
         return near[0], why or "the names of its layers"
     raise _open_error(known.state, near or scripts)
 
@@ -97,7 +96,7 @@ def _beside(path: Path, scripts: Sequence[Script]) -> tuple[str, list[Script]]:
     for maker, file, folder, words in _PLACES:
         left = [s for s in scripts if s.maker == maker]
         if left and re.fullmatch(file, path.name) and re.fullmatch(folder, path.absolute().parent.name):
-            return (words if len(left) < len(scripts) else ""), left
+            return words, left
     return "", list(scripts)
 
 
@@ -106,7 +105,12 @@ def _open_error(state: Mapping[Any, Any], scripts: Sequence[Script]) -> SourceEr
         f"{s.key}: {s.reading(state)}" + (f" ({s.maker}'s {s.evidence})" if s.evidence else "") for s in scripts
     )
     keys = list(dict.fromkeys(s.key for s in scripts))
-    what = "it may be of any of these scripts" if len(keys) > 1 else "no known script has quite the names of its layers"
+    if len(keys) > 1:
+        what = "it may be of any of these scripts"
+    elif scripts[0].common:
+        what = "its layers have names that networks of any kind have"
+    else:
+        what = "no known script has quite the names of its layers"
     return SourceError(
         f"{what}, and weights do not say what is computed with them",
         why=f"the readings are: {readings}" if len(keys) > 1 else f"the nearest is {readings}",

@@ -25,7 +25,8 @@ class Script(Struct, frozen=True, kw_only=True):
     - ``key``: what --script calls it; ``maker``: whose script it is; ``algorithm``: what it trains.
     - ``names``: how its tensors' names begin, each of them; ``without``: how no name begins.
     - ``head``: the module of the last layer, of ``least`` outputs or more; ``says``: what the {n} of them are.
-    - ``channels``: of the image, where the script fixes what they are.
+    - ``channels``: of the image, where the script fixes what they are. ``common``: the names are those that networks of
+      any kind have, unless they are of convolutions.
     - ``build``: makes the network; ``activation``: between layers in the scripts of ``evidence``. Without one,
       no script has quite these names.
     """
@@ -39,6 +40,7 @@ class Script(Struct, frozen=True, kw_only=True):
     least: int = 1
     says: str
     channels: int | None = None
+    common: bool = False
     build: Callable[[Making], None]
     activation: str = ""
     evidence: str = ""
@@ -48,6 +50,10 @@ class Script(Struct, frozen=True, kw_only=True):
         if self.channels is not None and shape_of(state, "network.0.weight")[1:2] != (self.channels,):
             return False
         return all(_begins(state, name) for name in self.names) and not any(_begins(state, n) for n in self.without)
+
+    def is_told_by_names(self, state: Mapping[Any, Any]) -> bool:
+        """Return whether the names alone tell that a state dictionary is the script's."""
+        return bool(self.activation) and not (self.common and len(shape_of(state, "network.0.weight")) < 3)
 
     @property
     def default(self) -> tuple[str, str] | None:
@@ -183,6 +189,7 @@ SCRIPTS = (
         algorithm="DQN or PQN",
         names=("network.0.",),
         without=("atoms", "actor.", "critic."),
+        common=True,
         head="network",
         least=2,
         says=_VALUES,
