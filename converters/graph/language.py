@@ -33,13 +33,17 @@ def identifier(name: str) -> str:
     return _WORDS.sub("_", name).strip("_") or "x"
 
 
-def comment(text: str) -> str:
-    """Return a text as a comment that it cannot leave: a source's names are untrusted.
+def in_comment(text: str) -> str:
+    """Return a text as words of a comment that it cannot leave: a source's names are untrusted.
 
     A ``*`` and a ``/`` on two lines end a comment, too, where a backslash, or C99's ``??/`` for it, joins the lines.
     """
-    safe = re.sub(r"[^ -~]|[\\?]", "_", text).replace("*/", "* /").replace("/*", "/ *")
-    return f"/* {safe} */"
+    return re.sub(r"[^ -~]|[\\?]", "_", text).replace("*/", "* /").replace("/*", "/ *")
+
+
+def comment(text: str) -> str:
+    """Return a text as a comment."""
+    return f"/* {in_comment(text)} */"
 
 
 def lines_of(words: Sequence[str]) -> str:

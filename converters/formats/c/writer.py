@@ -20,7 +20,7 @@ from converters.formats.c.extras import (
 from converters.formats.c.text import C_TYPES, C
 from converters.formats.format import WriteOptions
 from converters.formats.programs.members import Field
-from converters.formats.programs.plan import CLOSE, ROWS, Plan, formula, write_program
+from converters.formats.programs.plan import CLOSE, NAN_SAID, ROWS, Plan, formula, write_program
 from converters.formats.programs.weights import weights_name, widen_where_used
 from converters.graph.ops.loops.layers import box_muller, gumbel
 from converters.graph.printer import Printer
@@ -76,11 +76,12 @@ def _text(name: str, plan: Plan) -> str:
     printer = Printer(words, f"{p}_w_")
     by_name = {f.spec.name: f"input->{f.name}" for f in header.inputs}
     by_name |= {f.spec.name: f"memory->{f.name}" for f in header.own_values}
+    by_name |= {f.spec.name: f"allowed_{f.name}" for f, _ in plan.masks}
     for key, tensor in program.inputs.items():
         printer.called(tensor.place, by_name[key])
     body = _compute_lines(plan, printer)
     choose = _choose(p, plan.chosen, plan.sizes, printer.function(gumbel, "row[i]", "u")) if plan.chosen else ""
-    parts = [*_declarations(name, plan, choose), *_definitions(plan, printer, words, body, choose)]
+    parts = [*_declarations(name, plan, printer, choose), *_definitions(plan, printer, words, body, choose)]
     return "\n\n".join(parts) + "\n"
 
 
@@ -104,10 +105,15 @@ def _compute_lines(plan: Plan, printer: Printer) -> list[str]:
     return body
 
 
-def _declarations(name: str, plan: Plan, choose: str) -> list[str]:
+def _declarations(name: str, plan: Plan, printer: Printer, choose: str) -> list[str]:
     """What a program that includes the header sees: structures and functions, with what they do."""
     header, program = plan.header, plan.program
     p, sizes, loads = header.prefix, plan.sizes, plan.weights.file is not None
+    unmasked = "\n   Of a branch whose masks are all 0, as in an input of zeros, all actions are allowed." * bool(
+        plan.masks
+    )
+    unloaded = "; 2 before the weights are loaded" * loads
+    exact = ", with the masks as they are" * bool(plan.masks)
     return [
         f"/* {p}: a policy without a runtime. In one source file, write\n"
         f"       #define {p.upper()}_IMPLEMENTATION\n"
@@ -117,7 +123,7 @@ def _declarations(name: str, plan: Plan, choose: str) -> list[str]:
         f"#ifndef {p.upper()}_H\n#define {p.upper()}_H\n\n#include <stddef.h>\n#include <stdint.h>\n\n"
         f'#ifdef __cplusplus\nextern "C" {{\n#endif',
         sizes_text(plan),
-        _struct(f"{p}_input", "What an agent observes.", map(_member, header.inputs)),
+        _struct(f"{p}_input", f"What an agent observes. {NAN_SAID}", map(_member, header.inputs)),
         _struct(
             f"{p}_memory",
             "What an agent keeps: the stream of its draws, its state; the rest is for computing.",
@@ -137,11 +143,11 @@ def _declarations(name: str, plan: Plan, choose: str) -> list[str]:
         f"/* Begin an episode: no state, draws by a seed{'; the weights stay loaded' * loads}. */\n"
         f"void {p}_reset({p}_memory *memory, uint64_t seed);\n"
         f"/* Decide: draw the noise where there is some, then compute. 0; 1, and no output, where an observed index\n"
-        f"   lies outside of the table that it is looked up in{'; 2 before the weights are loaded' * loads}. */\n"
+        f"   lies outside of the table that it is looked up in{unloaded}.{unmasked} */\n"
         f"int {p}_act(const {p}_input *input, {p}_memory *memory, {p}_output *output);\n"
         f"/* The same for some agents, each with a memory of its own; how many of them have no output. */\n"
         f"int {p}_act_all(int agents, const {p}_input *input, {p}_memory *memory, {p}_output *output);\n"
-        f"/* Compute with the noise that stands in the memory (zeros: without chance). */\n"
+        f"/* Compute {plan.chance(printer, 'the memory')}{exact}. */\n"
         f"int {p}_compute(const {p}_input *input, {p}_memory *memory, {p}_output *output);\n"
         f"#ifdef {p.upper()}_SELFTEST\n"
         f"/* How many numbers are not what the policy's own kernels computed at export: 0. */\n"
@@ -157,6 +163,10 @@ def _definitions(plan: Plan, printer: Printer, words: C, body: Sequence[str], ch
     p, loads = header.prefix, plan.weights.file is not None
     normal = printer.function(box_muller, "radius", "turn") if header.noise else ""
     draws = plan.draws(printer)
+    takes, given = f"const {p}_input *input, {p}_memory *memory, {p}_output *output", "input, memory, output"
+    masks = "".join(f", const {C_TYPES[f.spec.dtype]} *allowed_{f.name}" for f, _ in plan.masks)
+    as_fed, allowed = ("".join(f", {each}{f.name}" for f, _ in plan.masks) for each in ("input->", "allowed_"))
+    computes = f"{p}_decide" if masks else f"{p}_compute"
     return [
         f"#ifdef __cplusplus\n}}\n#endif\n\n#endif\n\n"
         f"#ifdef {p.upper()}_IMPLEMENTATION\n#include <float.h>\n#include <math.h>\n#include <string.h>",
@@ -171,11 +181,15 @@ def _definitions(plan: Plan, printer: Printer, words: C, body: Sequence[str], ch
         + "    memset(memory, 0, sizeof *memory);\n"
         + ("    memory->weights = weights;\n" if loads else "")
         + "    memory->stream = seed;\n}",
-        f"int {p}_compute(const {p}_input *input, {p}_memory *memory, {p}_output *output)\n{{\n"
+        *(_allow(p, f, branches) for f, branches in plan.masks),
+        f"{'static ' * bool(masks)}int {computes}({takes}{masks})\n{{\n"
         f"    (void)input;\n    (void)memory;\n" + "\n".join(body) + "\n    return 0;\n}",
-        f"int {p}_act(const {p}_input *input, {p}_memory *memory, {p}_output *output)\n{{\n"
+        *([f"int {p}_compute({takes})\n{{\n    return {computes}({given}{as_fed});\n}}"] if masks else []),
+        f"int {p}_act({takes})\n{{\n"
+        + "".join(f"    {C_TYPES[f.spec.dtype]} allowed_{f.name}[{f.size}];\n" for f, _ in plan.masks)
+        + "".join(f"    {p}_allow_{f.name}(input->{f.name}, allowed_{f.name});\n" for f, _ in plan.masks)
         + "".join(f"    {p}_normal(memory, memory->{f.name}, {f.size});\n" for f in header.noise)
-        + f"    return {p}_compute(input, memory, output);\n}}",
+        + f"    return {computes}({given}{allowed});\n}}",
         f"int {p}_act_all(int agents, const {p}_input *input, {p}_memory *memory, {p}_output *output)\n{{\n"
         f"    int without = 0;\n"
         f"    for (int i = 0; i < agents; i++) without += {p}_act(&input[i], &memory[i], &output[i]);\n"
@@ -185,6 +199,19 @@ def _definitions(plan: Plan, printer: Printer, words: C, body: Sequence[str], ch
         _selftest(plan, words),
         "#endif",
     ]
+
+
+def _allow(prefix: str, field: Field, branches: Sequence[int]) -> str:
+    """The function that allows all actions of a branch of which no mask is set."""
+    kind = C_TYPES[field.spec.dtype]
+    return (
+        f"static void {prefix}_allow_{field.name}(const {kind} *masks, {kind} *allowed)\n{{\n"
+        f"    static const int sizes[{len(branches)}] = {{{', '.join(map(str, branches))}}};\n"
+        f"    for (int branch = 0; branch < {len(branches)}; branch++) {{\n        int none = 1;\n"
+        f"        for (int i = 0; i < sizes[branch]; i++) none = none && masks[i] == 0;\n"
+        f"        for (int i = 0; i < sizes[branch]; i++) allowed[i] = none ? 1 : masks[i];\n"
+        f"        masks += sizes[branch];\n        allowed += sizes[branch];\n    }}\n}}"
+    )
 
 
 def _choose(prefix: str, field: Field, sizes: Sequence[int], drawn: str) -> str:

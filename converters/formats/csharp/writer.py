@@ -11,12 +11,13 @@ from converters.files.chunks import Pieces
 from converters.formats.csharp.text import CS_TYPES, CSharp
 from converters.formats.format import WriteOptions
 from converters.formats.programs.members import Field
-from converters.formats.programs.plan import CLOSE, ROWS, Plan, formula, write_program
+from converters.formats.programs.plan import CLOSE, NAN_SAID, ROWS, Plan, formula, write_program
 from converters.formats.programs.weights import weights_name
 from converters.graph.ops.loops.layers import box_muller, gumbel
 from converters.graph.printer import Printer
 from converters.graph.program import Place
 from converters.policy.policy import Policy
+from signatures.roles import Role
 
 _UNIFORM = """
     /// <summary>The stream of draws, splitmix64: above 0, below 1. The same seed, the same draws as in C.</summary>
@@ -95,10 +96,11 @@ def _text(file: str, plan: Plan) -> str:
     methods = [
         *_beginning(name, plan, draws=draws),
         "    /// <summary>Decides: draws the noise where there is some, then computes.</summary>\n"
-        "    public void Act()\n    {\n"
+        + _copied(plan)
+        + "    public void Act()\n    {\n"
         + "".join(f"        _Normal(this.{f.name});\n" for f in header.noise)
         + "        Compute();\n    }",
-        "    /// <summary>Computes with the noise that stands in its members (zeros: without chance).</summary>\n"
+        f"    /// <summary>Computes {plan.chance(printer, 'its members')}.</summary>\n"
         '    /// <exception cref="System.IndexOutOfRangeException">An observed index lies outside.</exception>\n'
         "    public void Compute()\n    {\n" + "\n".join(body) + "\n    }",
         *([_choose(plan.chosen, plan.sizes, printer)] if plan.chosen else []),
@@ -115,7 +117,7 @@ def _text(file: str, plan: Plan) -> str:
     return (
         f"/* {name}: a policy without a runtime, C# 7.3 for .NET Standard 2.0: every Unity since 2018, Godot .NET.\n"
         f"   Made by export-model.\n\n{plan.contract}\n\nnamespace Policies\n{{\n\n"
-        f"/// <summary>One agent: what it observes, keeps and does are its members.</summary>\n"
+        f"/// <summary>One agent: what it observes, keeps and does are its members. {NAN_SAID}</summary>\n"
         f"public sealed class {name}\n{{\n" + "\n\n".join(inner) + "\n}\n\n}\n"
     )
 
@@ -152,12 +154,21 @@ def _beginning(name: str, plan: Plan, *, draws: bool) -> list[str]:
     header = plan.header
     quiet = "".join(f"        global::System.Array.Clear(this.{f.name}, 0, {f.size});\n" for f in header.own_values)
     stream = "        stream = seed;\n" if draws else ""
+    allowed = "".join(
+        f"        for (int i = 0; i < {f.size}; i++) this.{f.name}[i] = {_one(f, '1')};\n" for f, _ in plan.masks
+    )
     return [
         "    /// <summary>A new agent, whose draws begin with a seed.</summary>\n"
-        f"    public {name}(ulong seed = 0) {{ Reset(seed); }}",
+        f"    public {name}(ulong seed = 0)\n    {{\n{allowed}        Reset(seed);\n    }}",
         "    /// <summary>Begins an episode: no state, draws by a seed.</summary>\n"
         f"    public void Reset(ulong seed = 0)\n    {{\n{stream}{quiet}    }}",
     ]
+
+
+def _copied(plan: Plan) -> str:
+    """What is left to the caller of ``Act``."""
+    names = ", ".join(f.name for f in plan.header.inputs if f.spec.role is Role.PREV_ACTION)
+    return f"    /// <remarks>It does not change {names}: copy there what was done.</remarks>\n" if names else ""
 
 
 def _sizes(plan: Plan) -> str:

@@ -12,11 +12,12 @@ from converters.files.chunks import Pieces
 from converters.formats.format import WriteOptions
 from converters.formats.js.text import JS_ARRAYS, JavaScript
 from converters.formats.programs.members import Field
-from converters.formats.programs.plan import CLOSE, ROWS, Plan, formula, write_program
+from converters.formats.programs.plan import CLOSE, NAN_SAID, ROWS, Plan, formula, write_program
 from converters.formats.programs.weights import weights_name
 from converters.graph.ops.loops.layers import box_muller, gumbel
 from converters.graph.printer import Printer
 from converters.policy.policy import Policy
+from signatures.roles import Role
 
 _UNIFORM = """
     /** The stream of draws, splitmix64: above 0, below 1. The same seed gives the same draws as in C and C#. */
@@ -85,7 +86,7 @@ def _text(name: str, plan: Plan) -> str:
         + "    }",
         "    /** Decides: draws the noise where there is some, then computes. */\n    act() {\n"
         + f"{drawn}        this.compute();\n    }}",
-        "    /** Computes with the noise that stands in its members (zeros: without chance).\n"
+        f"    /** Computes {plan.chance(printer, 'its members')}.\n"
         "     *  Throws a RangeError where an observed index lies outside of its table. */\n    compute() {\n"
         + "\n".join(body)
         + "\n    }",
@@ -102,7 +103,8 @@ def _text(name: str, plan: Plan) -> str:
         "const { fround } = Math;",
         *words.helpers.values(),
         *weights,
-        f"/** One agent: what it observes, keeps and does are its members, arrays that live as long as it. */\n"
+        f"/** One agent: what it observes, keeps and does are its members, arrays that live as long as it.\n"
+        f" *  {NAN_SAID} */\n"
         f"export class {header.class_name} {{\n" + "\n\n".join(methods) + "\n}",
         "/** Names of the contract: [member, dtype, shape]; the state's member, and the name of its next value. */\n"
         f"export const ports = {json.dumps(_ports(plan))};",
@@ -171,7 +173,8 @@ def _unusual(plan: Plan, words: JavaScript) -> str:
 
 
 def _member(field: Field) -> str:
-    return f"        this.{field.name} = new {JS_ARRAYS[field.spec.dtype]}({field.size}); // {field.about}\n"
+    allowed = ".fill(1)" * (field.spec.role is Role.MASKS)
+    return f"        this.{field.name} = new {JS_ARRAYS[field.spec.dtype]}({field.size}){allowed}; // {field.about}\n"
 
 
 def _choose(field: Field, sizes: Sequence[int], printer: Printer) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 from msgspec import Struct
 
-from converters.graph.language import identifier
+from converters.graph.language import identifier, in_comment
 from converters.graph.nodes import NameScope
 from signatures.code import CodeOptions
 from signatures.errors import UnsupportedOpError
@@ -32,6 +32,17 @@ _KEYWORDS = tuple(
 )
 
 
+#: What is to be known of a member's numbers.
+_MEANINGS = {
+    Role.MASKS: "1: allowed, 0: forbidden",
+    Role.PREV_ACTION: "the caller copies here what was done, after each decision",
+    Role.NOISE: "drawn by each decision",
+    Role.MEMORY_IN: "kept from decision to decision",
+    Role.LOG_PROBS: "what classes are drawn by",
+    Role.DETERMINISTIC: "the action without chance",
+}
+
+
 class Field(Struct, frozen=True):
     """A member of one of the header's structs: ``size`` elements of a tensor of the policy."""
 
@@ -41,9 +52,12 @@ class Field(Struct, frozen=True):
 
     @property
     def about(self) -> str:
-        """What it is for, and its shape for one agent."""
-        shape = self.spec.shape[1:] if self.spec.batched else self.spec.shape
-        return f"{self.spec.role.value}, {' x '.join(map(str, shape)) or '1'}"
+        """What it is for, its shape for one agent, what its numbers mean, and what the source calls it."""
+        shape, source = self.spec.shape[1:] if self.spec.batched else self.spec.shape, self.spec.source
+        names = [n.removesuffix(":0") for n in ([source] if isinstance(source, str) else source or ())]
+        said = f"in the source {in_comment(', '.join(names)[:120])}" if names and names != [self.spec.name] else ""
+        words = (_MEANINGS.get(self.spec.role, ""), said)
+        return "; ".join(filter(None, (f"{self.spec.role.value}, {' x '.join(map(str, shape)) or '1'}", *words)))
 
 
 class Header(Struct, frozen=True):

@@ -29,6 +29,8 @@ from signatures.spec import PolicySignature
 
 #: Golden rows of the self test, and how far float32 may be off.
 ROWS = 3
+#: What all languages say of numbers that are none.
+NAN_SAID = "NaN is not looked for: numbers made of one are NaN, a class that is drawn by them is 0."
 #: Numbers that the self test of a header compares; a policy has some hundreds, and the text of more says nothing.
 MAX_GOLDEN = 1 << 16
 CLOSE = "1e-4"
@@ -59,6 +61,18 @@ class Plan(Struct, frozen=True):
     weights: Weights
     code: CodeOptions
     guarded: tuple[Guarded, ...] = ()
+
+    @property
+    def masks(self) -> list[tuple[Field, tuple[int, ...]]]:
+        """The members that say what is allowed, and how many actions of them each branch has."""
+        fields = [f for f in self.header.inputs if f.spec.role is Role.MASKS]
+        return [(f, self.sizes if sum(self.sizes) == f.size else (f.size,)) for f in fields]
+
+    def chance(self, printer: Printer, noise: str) -> str:
+        """What ``compute`` does with chance; ``noise`` says where it stands."""
+        said = [f"with the noise that stands in {noise} (zeros: without chance)"] if self.header.noise else []
+        said += ["drawing by the agent's stream"] if printer.draws else []
+        return ", ".join(said) or "without chance"
 
     def draws(self, printer: Printer) -> bool:
         """Whether an agent draws numbers, once its loops are printed."""
