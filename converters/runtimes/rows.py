@@ -9,6 +9,8 @@ import numpy as np
 from converters.files.children.frames import Tensors
 from converters.formats.programs.members import Field, Header
 
+OUTSIDE = "an index of {} inputs lies outside of the table that it is looked up in"
+
 
 def row_count(header: Header, feeds: Tensors) -> int:
     """Count the agents that are fed."""

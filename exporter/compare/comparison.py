@@ -186,6 +186,7 @@ class _Comparison(Struct, frozen=True):
                         drawn=candidate.drawn,
                         path=path,
                         fed=candidate.own_feeds,
+                        called={**{n: p.name for n, p in candidate.inputs.items()}, **candidate.outputs},
                         again=again,
                     )
 

@@ -207,6 +207,12 @@ class Rollout(Numbers, frozen=True):
     kind = "rollout"
 
 
+class Acting(Numbers, frozen=True):
+    """An output's numbers as callers of source code get them: several agents act, each by its own noise and state."""
+
+    kind = "acting"
+
+
 class Shape(Finding, frozen=True):
     """A drawn output's shape, dtype and range."""
 

@@ -132,6 +132,8 @@ class Participant(Struct, kw_only=True):
     path: Path | None = None
     #: what the model itself is fed, where any tool may have made it: its own names for the policy's inputs
     fed: Callable[[Feeds], Feeds] | None = None
+    #: what the model calls the policy's inputs and outputs, where not the same
+    called: Mapping[str, str] = field(default_factory=dict)
     #: loads it anew
     again: Loading | None = None
 

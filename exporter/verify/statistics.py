@@ -117,6 +117,26 @@ def same_distribution(reference: np.ndarray, draws: np.ndarray, atol: float, rto
     return min(1.0, max(0.0, 2 * total))
 
 
+def normal_fit(values: np.ndarray) -> float:
+    """The p-value of independent draws of N(0, 1): their mean, their variance, and Kolmogorov-Smirnov's distance.
+
+    The distance by the inequality of Dvoretzky, Kiefer and Wolfowitz, the variance by Wilson and Hilferty's cube root.
+    """
+    x = np.sort(values.reshape(-1).astype(np.float64))
+    n = x.size
+    below = np.array([math.erfc(-each / math.sqrt(2)) / 2 for each in x.tolist()])
+    places = np.arange(n)
+    distance = max(float(((places + 1) / n - below).max()), float((below - places / n).max()))
+    middle, width = 1 - 2 / (9 * n), math.sqrt(2 / (9 * n))
+    cube = (math.cbrt(float(np.square(x).mean())) - middle) / width
+    p_values = (
+        2 * math.exp(-2 * n * distance**2),
+        math.erfc(abs(cube) / math.sqrt(2)),
+        math.erfc(abs(float(x.mean())) * math.sqrt(n / 2)),
+    )
+    return min(1.0, len(p_values) * min(p_values))
+
+
 def _ahead(a: np.ndarray, b: np.ndarray, atol: float, rtol: float) -> int:
     """How many more of sorted ``a`` than of sorted ``b`` are at most x, at worst, b's being given the tolerance."""
     below = np.searchsorted(b, a + atol + rtol * np.abs(a), side="right")

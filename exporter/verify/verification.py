@@ -8,6 +8,7 @@ from msgspec.structs import replace
 
 from converters.files.children.process import LoadedModel, RunFailedError
 from converters.runtimes.pool import INDEPENDENT
+from exporter.verify.checks.agents import agents
 from exporter.verify.checks.consumer import consumers
 from exporter.verify.checks.densities import densities
 from exporter.verify.checks.draws import draws
@@ -37,7 +38,7 @@ Participants = Callable[[LoadedModel, Failure], Iterable[Participant]]
 Judge = Callable[[PolicyUnderTest, Session, Participants | None], ParityReport]
 Check = Callable[[Trial, Participant], Iterator[Finding]]
 #: What each participant is put through, one after the other.
-CHECKS: tuple[Check, ...] = (numbers, rollout, draws, densities)
+CHECKS: tuple[Check, ...] = (numbers, rollout, draws, densities, agents)
 
 
 def verify(

@@ -14,18 +14,22 @@ from msgspec.structs import replace
 
 from converters.formats.format import Format, WriteOptions
 from converters.formats.programs.members import header_of
+from converters.formats.registry import WRITTEN
 from converters.graph.nodes import Graph, Node, TensorShape
 from converters.graph.run import run_graph
 from converters.graph.types import FLOAT32
 from converters.policy.policy import Policy
 from converters.runtimes.pool import RuntimePool
+from exporter.compare.comparison import CompareOptions, compare_artefacts
+from exporter.export.pipeline import ExportOptions, export
 from exporter.export.sources import read_source
 from fixtures import FIXTURES, path
 from signatures.code import CodeOptions
+from signatures.errors import UnsupportedOpError
 from tests.graph.harness import Runtimes, policy_of
 from tests.programs.mains import MAINS, called
 from tests.programs.test_options import build, said
-from tests.programs.test_programs import PROGRAMS
+from tests.programs.test_programs import PROGRAMS, need
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("programs")]
 
@@ -107,18 +111,46 @@ def test_inputs_called_as_a_program_calls_something(
 @pytest.mark.parametrize("name", ["act", "reset", "math", "float32Array", "exp", "block", "sizes", "bigInt", "int"])
 @each_program
 def test_policies_called_as_a_program_calls_something(form: Format, name: str, tmp_path: Path) -> None:
-    """Draws, the state and the guard included."""
+    """Draws, the state and the guard included. A header is compiled as the page says, with its folder as one of -I."""
     (policy,) = read_source(path("recurrent")).policies()
-    expected = tmp_path / "expected"
-    for folder, stem in ((expected, policy.name), (tmp_path / "found", name)):
-        folder.mkdir()
-        named = replace(policy, name=stem)
-        for each, pieces in form.artifact(named, WriteOptions("{}")).files.items():
-            (folder / each).write_bytes(pieces.to_bytes())
+    named, expected, here = replace(policy, name=name), tmp_path / "expected", tmp_path / "found"
+    if form.key == "c" and name == "math":
+        with pytest.raises(UnsupportedOpError, match=r"a header cannot be called math\.h"):
+            form.artifact(named, WriteOptions("{}"))
+        return
+    form.artifact(policy, WriteOptions("{}")).write(expected)
+    form.artifact(named, WriteOptions("{}")).write(here)
     main = MAINS[form.key][0]
     wanted = said(build(form, main(called(policy)), expected), expected)
-    here = tmp_path / "found"
-    assert said(build(form, main(called(replace(policy, name=name))), here), here) == wanted
+    assert said(build(form, main(called(named)), here), here) == wanted
+
+
+def test_no_policy_takes_the_place_of_a_header() -> None:
+    """Any header that is included, by programs or by others, is refused by name."""
+    gcc = shutil.which("gcc") or pytest.skip("gcc is not installed")
+    text = "".join(
+        f"#include <{name}.h>\n" for name in ("stddef", "stdint", "float", "math", "string", "stdio", "stdlib")
+    )
+    command = [str(gcc), "-M", "-xc", "-"]
+    made = subprocess.run(command, input=text, capture_output=True, text=True, check=True).stdout
+    included = {Path(word).stem for word in made.split() if re.fullmatch(r"/usr/(lib/gcc/.*/|)include/[^/]*\.h", word)}
+    assert {"math", "string", "features", "stdio"} <= included
+    (policy,) = read_source(path("recurrent")).policies()
+    for name in sorted({*included, "Math", "string", "float"}):
+        with pytest.raises(UnsupportedOpError, match="a header cannot be called"):
+            WRITTEN["c"].artifact(replace(policy, name=name), WriteOptions("{}"))
+
+
+def test_a_header_is_judged_under_its_own_name(tmp_path: Path) -> None:
+    """One that another tool has renamed does not compile, and was called right."""
+    need(WRITTEN["c"])
+    (result,) = export([path("continuous")], ExportOptions(tmp_path, ("bytes", "c"), verify="none"))
+    text = (result.folder / "continuous.h").read_text()
+    other = tmp_path / "math.h"
+    other.write_text(text.replace("continuous_", "math_").replace("CONTINUOUS_", "MATH_"))
+    report = compare_artefacts(result.folder / "continuous.bytes", other, CompareOptions())
+    assert report.passed is False
+    assert "CompileError" in report.failures[0].reason
 
 
 def test_no_macro_of_the_headers_is_a_member() -> None:

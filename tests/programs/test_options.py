@@ -45,7 +45,7 @@ def build(form: Format, main: str, folder: Path) -> list[str]:
     file.write_text(main, "ascii")
     if form.key == "c":
         for each in filter(None, map(shutil.which, ("clang", "gcc"))):
-            subprocess.run([each, *PLAIN, "-o", "main", file.name, "-lm"], check=True, cwd=folder)
+            subprocess.run([each, *PLAIN, "-I.", "-o", "main", file.name, "-lm"], check=True, cwd=folder)
         return [str(folder / "main")]
     if form.key == "csharp":
         mcs, mono = tools() or ("", "")

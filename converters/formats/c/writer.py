@@ -26,6 +26,7 @@ from converters.graph.ops.loops.layers import box_muller, gumbel
 from converters.graph.printer import Printer
 from converters.graph.program import arena_of
 from converters.policy.policy import Policy
+from signatures.errors import UnsupportedOpError
 
 _DRAWS = """
 /* The stream of draws: splitmix64 (Steele, Lea and Flood 2014), its top 23 bits, in the middle of their step: above 0,
@@ -64,8 +65,25 @@ _STRICT = """
 """
 
 
+#: Headers of C, C23's too, and those that these include in glibc, newlib and Visual C++: a file of one of these names,
+#: beside the program or in a folder of -I, is included in its place.
+_LIBRARY_HEADERS = frozenset(
+    """assert complex ctype errno fenv float inttypes iso646 limits locale math setjmp signal stdalign stdarg stdatomic
+    stdbit stdbool stdckdint stddef stdint stdio stdlib stdnoreturn string tgmath threads time uchar wchar wctype
+    alloca corecrt crtdefs endian features features-time64 malloc memory newlib reent sal stdc-predef strings unistd
+    vadefs vcruntime yvals""".split()  # noqa: SIM905  a list of forty lines otherwise
+)
+
+
 def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
-    """The header. Raises UnsupportedOpError."""
+    """The header. Raises UnsupportedOpError, too where it would be taken for one of the C library's."""
+    if policy.name.lower() in _LIBRARY_HEADERS:  # file systems ignore case
+        raise UnsupportedOpError(
+            f"a header cannot be called {policy.name}.h",
+            issues=[],
+            why=f"programs would include it in the place of <{policy.name.lower()}.h>, which it needs itself",
+            fix="give the policy another name: --name",
+        )
     return write_program(policy, options, ".h", _text)
 
 

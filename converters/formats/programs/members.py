@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from msgspec import Struct
 
@@ -84,6 +84,11 @@ class Header(Struct, frozen=True):
     def fed(self) -> tuple[Field, ...]:
         """All that a decision is made of."""
         return (*self.inputs, *self.own_values)
+
+    def chosen(self, branches: Sequence[int]) -> Field | None:
+        """The output that classes are drawn by, where there is one of so many branches."""
+        found = next((f for f in self.outputs if f.spec.role is Role.LOG_PROBS), None)
+        return found if found is not None and sum(branches) == found.size else None
 
     @property
     def answered(self) -> tuple[Field, ...]:

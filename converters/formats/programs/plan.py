@@ -119,8 +119,6 @@ def _plan(policy: Policy, options: WriteOptions) -> Plan:
             )
     contract = _in_comment(options.contract)
     sizes = tuple(policy.signature.branches)
-    chosen = next((f for f in header.outputs if f.spec.role is Role.LOG_PROBS), None)
-    chosen = chosen if chosen is not None and sum(sizes) == chosen.size else None
     checked, golden = _golden(policy, header)
     weights = weights_of(program, options.weights, in_file=code.weights == "file")
     guarded = () if code.guard is None else _guarded(policy.name, header, code.guard)
@@ -129,7 +127,7 @@ def _plan(policy: Policy, options: WriteOptions) -> Plan:
         header=header,
         program=program,
         contract=text,
-        chosen=chosen,
+        chosen=header.chosen(sizes),
         sizes=sizes,
         checked=checked,
         golden=golden,

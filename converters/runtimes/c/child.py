@@ -25,9 +25,11 @@ from converters.files.children.frames import Tensors
 from converters.formats.programs.artifact import contract_held
 from converters.formats.programs.members import Header, header_of
 from converters.formats.programs.weights import weights_name
+from converters.runtimes.agents import AGENTS, CHOSEN, SIZES, UNUSUAL, Drive, fetched, shown, sized
 from converters.runtimes.base import REFUSED
-from converters.runtimes.rows import as_declared, fed_rows, row_count
+from converters.runtimes.rows import OUTSIDE, as_declared, fed_rows, row_count
 from signatures.code import CodeOptions
+from signatures.contract import safe_name
 from signatures.errors import ExportModelError
 
 FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-O2", "-ffp-contract=off", "-fPIC", "-shared")
@@ -44,8 +46,11 @@ class CompileError(Exception):
     """The compiler's own words."""
 
 
-def driver(header: Header, code: CodeOptions) -> str:
-    """A source file that calls a header's functions row by row, for whatever is fed under the policy's names."""
+def driver(file: str, header: Header, code: CodeOptions, branches: Sequence[int] = ()) -> str:
+    """A source file that calls a header's functions row by row, for whatever is fed under the policy's names.
+
+    And for ``AGENTS`` agents, each with its own memory.
+    """
     p = header.prefix
     state = [header.state] if header.state else []
     fed = [f"input.{f.name}" for f in header.inputs] + [f"memory.{f.name}" for f in (*header.noise, *state)]
@@ -56,24 +61,68 @@ def driver(header: Header, code: CodeOptions) -> str:
     loads, load = code.weights == "file", "int judge_load(const void *weights, size_t size)"
     lines = "\n        ".join([*copies, f"without += {p}_compute(&input, &memory, &output);", *answers])
     return (
-        f'#define {p.upper()}_IMPLEMENTATION\n#define {p.upper()}_SELFTEST\n#include "policy.h"\n#include <stddef.h>\n'
-        f"static {p}_memory memory;\nvoid judge_reset(uint64_t seed);\nint judge_selftest(void);\n"
+        f'#define {p.upper()}_IMPLEMENTATION\n#define {p.upper()}_SELFTEST\n#include "{file}"\n#include <stddef.h>\n'
+        f"static {p}_memory memory, memories[{AGENTS}];\nvoid judge_reset(uint64_t seed);\nint judge_selftest(void);\n"
         f"int judge(size_t rows, const void *const *in, void *const *out);\n"
-        + (f"{load};\n{load} {{ return {p}_load(&memory, weights, size); }}\n" if loads else "")
+        + (f"{load};\n{load}\n{{\n    for (int i = 0; i < {AGENTS}; i++)\n" if loads else "")
+        + (f"        if ({p}_load(&memories[i], weights, size)) return 4;\n" if loads else "")
+        + (f"    return {p}_load(&memory, weights, size);\n}}\n" if loads else "")
         + f"void judge_reset(uint64_t seed) {{ {p}_reset(&memory, seed); }}\n"
         f"int judge_selftest(void) {{ return {p}_selftest(&memory); }}\n"
         f"int judge(size_t rows, const void *const *in, void *const *out)\n{{\n    static {p}_input input;\n"
         f"    static {p}_output output;\n    int without = 0;\n    (void)in;\n    (void)out;\n"
         f"    for (size_t row = 0; row < rows; row++) {{\n        {lines}\n    }}\n    return without;\n}}\n"
+        + _agents_driver(header, code, branches)
     )
+
+
+def _agents_driver(header: Header, code: CodeOptions, branches: Sequence[int]) -> str:
+    """The functions that drive agents, which take turns in one array."""
+    p, each, state = header.prefix, f"    for (int i = 0; i < {AGENTS}; i++) ", header.state
+    keep = f"memories[i].{state.name}" if state else ""
+    members = [f"outputs[i].{f.name}" for f in header.outputs] + [f"memories[i].{f.name}" for f in header.noise]
+    members += [keep] if state and header.next_state else []
+    fed = [(f"inputs[i].{f.name}", f"(const char *)in[{n}] + (size_t)i * sizeof ") for n, f in enumerate(header.inputs)]
+    take = " ".join(f"memcpy({to}, {source}{to}, sizeof {to});" for to, source in fed)
+    place = f"(size_t)(turn * {AGENTS} + i) * sizeof "
+    tell = " ".join(f"memcpy((char *)out[{n}] + {place}{at}, {at}, sizeof {at});" for n, at in enumerate(members))
+    sizes = "".join(f"{p}_size_{f.name}, " for f in sized(header))
+    functions = {
+        "void judge_begin(uint64_t seed)": [f"{each}{p}_reset(&memories[i], seed + (uint64_t)i);"],
+        "int judge_act(int repeat, const void *const *in, void *const *out)": [
+            f"    static {p}_input inputs[{AGENTS}];\n    int without = 0;\n    (void)in;\n    (void)out;",
+            *([f"    static char kept[{AGENTS}][sizeof memories[0].{state.name}];"] if state else []),
+            f"{each}{{ {take} }}",
+            *([f"{each}memcpy(kept[i], {keep}, sizeof kept[i]);"] if state else []),
+            "    for (int turn = 0; turn < repeat; turn++) {",
+            *([f"    {each}memcpy({keep}, kept[i], sizeof kept[i]);"] if state else []),
+            f"        without += {p}_act_all({AGENTS}, inputs, memories, outputs);\n    {each}{{ {tell} }}\n    }}",
+            *([f"{each}unusual[i] = {p}_unusual(&inputs[i]);"] if code.guard is not None else []),
+            "    return without;",
+        ],
+        "void judge_choose(int count, int32_t *classes)": [
+            "    (void)count;\n    (void)classes;",
+            f"{each}for (int n = 0; n < count; n++, classes += {len(branches)})",
+            f"        {p}_choose(&memories[i], &outputs[i], classes);" if header.chosen(branches) else "        {}",
+        ],
+        "int judge_sizes(int32_t *sizes, int32_t *counts)": [
+            f"    static const int32_t known[] = {{{sizes}0}};",
+            f"    static const int32_t branches[] = {f'{p.upper()}_BRANCHES' if branches else '{0}'};",
+            f"{each}counts[i] = unusual[i];\n    memcpy(sizes, known, sizeof known);",
+            f"    for (int i = 0; i < {len(branches)} && i < (int)(sizeof branches / 4); i++)",
+            f"        sizes[{len(sized(header))} + i] = branches[i];\n    return (int)(sizeof branches / 4);",
+        ],
+    }
+    text = "\n".join("\n".join([f"{head};", head, "{", *body, "}"]) for head, body in functions.items())
+    return f"static {p}_output outputs[{AGENTS}];\nstatic int32_t unusual[{AGENTS}];\n{text}\n"
 
 
 class _Library:
     def __init__(self, path: Path, seed: int, build: _Builder) -> None:
         contract = contract_held(path)
         code = CodeOptions.of(contract.tool)
-        self.header = header_of(path.stem, contract.signature, code)
-        self.library = ctypes.CDLL(str(build(driver(self.header, code), path)))
+        self.header, self.branches = header_of(path.stem, contract.signature, code), contract.signature.branches
+        self.library = ctypes.CDLL(str(build(self.header, code, self.branches, path)))
         if code.weights == "file":
             file = path.with_name(weights_name(path.stem)).read_bytes()
             self.weights = np.frombuffer(
@@ -87,15 +136,33 @@ class _Library:
         self.library.judge_reset(ctypes.c_uint64(seed))
 
     def run(self, feeds: Tensors, fetch: Sequence[str], request: Mapping[str, Any]) -> Tensors:
+        if (drive := Drive.of(request)) is not None:
+            return self._drive(drive, feeds, fetch)
         header, outputs = self.header, self.header.answered
         rows = row_count(header, feeds)
         fed = [fed_rows(f, feeds.get(f.spec.name), rows, _C_DTYPES) for f in header.fed]
         made = [np.zeros((rows, f.size), _C_DTYPES.get(f.spec.dtype, f.spec.dtype)) for f in outputs]
         pointers = [(ctypes.c_void_p * max(1, len(a)))(*(x.ctypes.data for x in a)) for a in (fed, made)]
         if without := self.library.judge(ctypes.c_size_t(rows), *pointers):
-            raise ValueError(f"an index of {without} inputs lies outside of the table that it is looked up in")
+            raise ValueError(OUTSIDE.format(without))
         found = {f.spec.name: as_declared(f, a, rows) for f, a in zip(outputs, made, strict=True)}
         return {name: found[name] for name in fetch}
+
+    def _drive(self, drive: Drive, feeds: Tensors, fetch: Sequence[str]) -> Tensors:
+        header, size = self.header, (drive.repeat, AGENTS)
+        fed = [fed_rows(f, feeds.get(f.spec.name), AGENTS, _C_DTYPES) for f in header.inputs]
+        made = [np.zeros((*size, f.size), _C_DTYPES.get(f.spec.dtype, f.spec.dtype)) for f in shown(header)]
+        pointers = [(ctypes.c_void_p * max(1, len(a)))(*(x.ctypes.data for x in a)) for a in (fed, made)]
+        classes = np.zeros((AGENTS, drive.choose, len(self.branches)), np.int32)
+        sizes, counts = np.zeros(len(sized(header)) + len(self.branches) + 1, np.int32), np.zeros(AGENTS, np.int32)
+        if drive.seed is not None:
+            self.library.judge_begin(ctypes.c_uint64(drive.seed))
+        if without := self.library.judge_act(drive.repeat, *pointers):
+            raise ValueError(OUTSIDE.format(without))
+        self.library.judge_choose(drive.choose, ctypes.c_void_p(classes.ctypes.data))
+        count = self.library.judge_sizes(*(ctypes.c_void_p(a.ctypes.data) for a in (sizes, counts)))
+        sizes[-1] = count if self.branches else 0
+        return fetched(header, fetch, made) | {CHOSEN: classes, SIZES: sizes, UNUSUAL: counts}
 
 
 class _Builder:
@@ -104,11 +171,13 @@ class _Builder:
     def __init__(self, folder: Path, asked: BinaryIO, answers: BinaryIO) -> None:
         self.folder, self.asked, self.answers, self.count = folder, asked, answers, 0
 
-    def __call__(self, source: str, header: Path) -> Path:
+    def __call__(self, header: Header, code: CodeOptions, branches: Sequence[int], path: Path) -> Path:
         self.count += 1
-        file = self.folder / f"{self.count}.c"
-        file.write_text(source, "ascii")
-        shutil.copyfile(header, self.folder / "policy.h")
+        file = self.folder / str(self.count) / "judge.c"
+        file.parent.mkdir()
+        name = path.name if safe_name(path.name) == path.name else "policy.h"
+        file.write_text(driver(name, header, code, branches), "ascii")
+        shutil.copyfile(path, file.with_name(name))
         self.asked.write(f"{self.count}\n".encode())
         self.asked.flush()
         answer = json.loads(self.answers.readline())
@@ -120,9 +189,10 @@ class _Builder:
 def _compile(program: str, folder: Path, asked: BinaryIO, answers: BinaryIO) -> None:
     """Compile what is asked for until nobody asks."""
     for line in asked:
-        file = folder / f"{int(line)}.c"  # what asks has loaded libraries: no path, and no option, of theirs
-        command = [program, *FLAGS, "-o", str(file.with_suffix(".so")), str(file), "-lm"]
-        size = (folder / "policy.h").stat().st_size
+        file = folder / str(int(line)) / "judge.c"  # what asks has loaded libraries: no path, and no option, of theirs
+        # As the page says: its folder is one of those that the C library's headers are looked for in.
+        command = [program, *FLAGS, f"-I{file.parent}", "-o", str(file.with_suffix(".so")), str(file), "-lm"]
+        size = sum(each.stat().st_size for each in file.parent.glob("*.h"))
         done = run_bounded(
             command,
             folder,

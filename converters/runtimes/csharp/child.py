@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import os
 import shutil
+import struct
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +25,9 @@ from converters.files.children.frames import Tensors
 from converters.formats.programs.artifact import contract_held
 from converters.formats.programs.members import Field, Header, header_of
 from converters.formats.programs.weights import weights_name
+from converters.runtimes.agents import AGENTS, CHOSEN, SIZES, UNUSUAL, Drive, fetched, shown, sized
 from converters.runtimes.base import REFUSED
-from converters.runtimes.rows import as_declared, fed_rows, row_count
+from converters.runtimes.rows import OUTSIDE, as_declared, fed_rows, row_count
 from signatures.code import CodeOptions
 from signatures.errors import ExportModelError
 
@@ -42,19 +44,23 @@ class CompileError(Exception):
     """The compiler's own words."""
 
 
-def driver(header: Header, code: CodeOptions) -> str:
-    """Return a program that feeds a class row by row: what it reads and writes lies one after the other, in bytes."""
+def _copies(header: Header, fields: Sequence[Field], into: bool) -> str:
+    """Statements that feed an agent from a row of ``input``, or write what it has into ``output``."""
+    lines, at = list[str](), 0
+    for f in fields:
+        size = f.size * np.dtype(f.spec.dtype).itemsize
+        member = f"agent.{(header.state if f is header.next_state and header.state else f).name}"
+        ends = f"input, row * {_bytes(fields)} + {at}, {member}, 0" if into else f"{member}, 0, output, {at}"
+        lines.append(f"System.Buffer.BlockCopy({ends}, {size});")
+        at += size
+    return " ".join(lines)
 
-    def copies(fields: Sequence[Field], into: bool) -> str:
-        lines, at = list[str](), 0
-        for f in fields:
-            size = f.size * np.dtype(f.spec.dtype).itemsize
-            member = f"agent.{(header.state if f is header.next_state and header.state else f).name}"
-            ends = f"input, row * {_bytes(fields)} + {at}, {member}, 0" if into else f"{member}, 0, output, {at}"
-            lines.append(f"System.Buffer.BlockCopy({ends}, {size});")
-            at += size
-        return " ".join(lines)
 
+def driver(header: Header, code: CodeOptions, branches: Sequence[int] = ()) -> str:
+    """Return a program that feeds a class row by row: what it reads and writes lies one after the other, in bytes.
+
+    A number of rows below 0 asks for a decision of each of ``AGENTS`` agents.
+    """
     file = "using (var file = System.IO.File.OpenRead(words[1]))"
     load = f"{file} Policies.{header.class_name}.Load(file);\n        " if code.weights == "file" else ""
     return f"""
@@ -74,12 +80,13 @@ static class Driver
         while (true) {{
             int rows;
             try {{ rows = reader.ReadInt32(); }} catch (System.IO.EndOfStreamException) {{ return 0; }}
+            if (rows < 0) {{ Drive(reader, writer); continue; }}
             byte[] input = reader.ReadBytes(rows * {_bytes(header.fed)});
             for (int row = 0; row < rows; row++) {{
-                {copies(header.fed, True)}
+                {_copies(header, header.fed, True)}
                 byte outside = 0;
                 try {{ agent.Compute(); }} catch (System.IndexOutOfRangeException) {{ outside = 1; }}
-                {copies(header.answered, False)}
+                {_copies(header, header.answered, False)}
                 writer.Write(outside);
                 writer.Write(output);
             }}
@@ -87,8 +94,77 @@ static class Driver
             System.GC.KeepAlive(input);
         }}
     }}
+{_agents_driver(header, code, branches)}
 }}
 """
+
+
+def _agents_driver(header: Header, code: CodeOptions, branches: Sequence[int]) -> str:
+    """The method that lets agents act in turn, each of them as an object; all are looked at when all have acted."""
+    kind, state = f"Policies.{header.class_name}", header.state
+    size = _bytes([state]) if state else 0
+    keep, restore = (
+        f"System.Buffer.BlockCopy({ends}, {size});" if state else ""
+        for ends in (
+            (f"agent.{state.name}, 0, kept[row], 0", f"kept[row], 0, agent.{state.name}, 0") if state else ("", "")
+        )
+    )
+    sizes = "".join(f" writer.Write({kind}.Sizes.{f.name});" for f in sized(header))
+    agent, each = f"{kind} agent = agents[row];", f"for (int row = 0; row < {AGENTS}; row++)"
+    choose = (
+        f"""var classes = new int[{len(branches)}];
+        foreach (var agent in agents)
+            for (int turn = 0; turn < choose; turn++) {{
+                agent.Choose(classes);
+                foreach (int one in classes) writer.Write(one);
+            }}"""
+        if header.chosen(branches)
+        else ""
+    )
+    return f"""
+    static {kind}[] agents;
+    static void Drive(System.IO.BinaryReader reader, System.IO.BinaryWriter writer)
+    {{
+        bool begins = reader.ReadBoolean();
+        ulong seed = reader.ReadUInt64();
+        int repeat = reader.ReadInt32(), choose = reader.ReadInt32(), outside = 0 * choose;
+        byte[] input = reader.ReadBytes({AGENTS * _bytes(header.inputs)});
+        bool made = agents == null;
+        if (made) agents = new {kind}[{AGENTS}];
+        var kept = new byte[{AGENTS}][];
+        {each} {{
+            if (made) agents[row] = new {kind}(seed + (ulong)row);
+            else if (begins) agents[row].Reset(seed + (ulong)row);
+        }}
+        {each} {{
+            {agent}
+            {_copies(header, header.inputs, True)}
+            System.GC.KeepAlive(agent);
+            kept[row] = new byte[{size}];
+            {keep}
+        }}
+        var output = new byte[{_bytes(shown(header))}];
+        for (int turn = 0; turn < repeat; turn++) {{
+            {each} {{
+                {agent}
+                {restore}
+                try {{ agent.Act(); }} catch (System.IndexOutOfRangeException) {{ outside++; }}
+            }}
+            {each} {{
+                {agent}
+                {_copies(header, shown(header), False)}
+                writer.Write(output);
+            }}
+        }}
+        writer.Write(outside);
+        {choose}
+        {sizes}
+        for (int i = 0; i < {len(branches)}; i++) writer.Write(i < {kind}.Branches.Length ? {kind}.Branches[i] : 0);
+        writer.Write({kind}.Branches.Length);
+        {each} writer.Write({"agents[row].Unusual()" if code.guard is not None else "0"});
+        writer.Flush();
+        System.GC.KeepAlive(input);
+    }}"""
 
 
 def _bytes(fields: Sequence[Field]) -> int:
@@ -99,12 +175,12 @@ class _Program:
     def __init__(self, path: Path, seed: int, folder: Path, compiler: str, mono: str) -> None:
         contract = contract_held(path)
         code = CodeOptions.of(contract.tool)
-        self.header = header_of(path.stem, contract.signature, code)
+        self.header, self.branches = header_of(path.stem, contract.signature, code), contract.signature.branches
         own = Path(tempfile.mkdtemp(dir=folder))
         if code.weights == "file":
             shutil.copyfile(path.with_name(weights_name(path.stem)), own / "weights.bin")
         shutil.copyfile(path, own / "policy.cs")
-        (own / "driver.cs").write_text(driver(self.header, code), "ascii")
+        (own / "driver.cs").write_text(driver(self.header, code, self.branches), "ascii")
         size = path.stat().st_size
         done = run_bounded(
             [compiler, *FLAGS, "-out:policy.exe", "policy.cs", "driver.cs"],
@@ -140,6 +216,8 @@ class _Program:
         return found
 
     def run(self, feeds: Tensors, fetch: Sequence[str], request: Mapping[str, Any]) -> Tensors:
+        if (drive := Drive.of(request)) is not None:
+            return self._drive(drive, feeds, fetch)
         header, rows = self.header, row_count(self.header, feeds)
         fed = [fed_rows(f, feeds.get(f.spec.name), rows) for f in header.fed]
         parts = [a.view(np.uint8).reshape(rows, -1) for a in fed]
@@ -152,21 +230,44 @@ class _Program:
             pipe.flush()
             kept.append(self._read(1 + _bytes(header.answered)))
         if without := sum(answer[0] for answer in kept):
-            raise ValueError(f"an index of {without} inputs lies outside of the table that it is looked up in")
+            raise ValueError(OUTSIDE.format(without))
         made = np.frombuffer(b"".join(kept), np.uint8).reshape(rows, -1)[:, 1:]
-        found, at = {}, 0
-        for f in header.answered:
-            size = _bytes([f])
-            array = np.ascontiguousarray(made[:, at : at + size]).view(f.spec.dtype)
-            found[f.spec.name] = as_declared(f, array, rows)
-            at += size
+        found = {f.spec.name: as_declared(f, a, rows) for f, a in _cut(header.answered, made)}
         return {name: found[name] for name in fetch}
+
+    def _drive(self, drive: Drive, feeds: Tensors, fetch: Sequence[str]) -> Tensors:
+        header, pipe, count = self.header, self.process.stdin, drive.repeat * AGENTS
+        assert pipe is not None
+        fed = [fed_rows(f, feeds.get(f.spec.name), AGENTS).view(np.uint8).reshape(AGENTS, -1) for f in header.inputs]
+        pipe.write(struct.pack("<i?Qii", -1, drive.seed is not None, drive.seed or 0, drive.repeat, drive.choose))
+        pipe.write(np.concatenate(fed, axis=1).tobytes() if fed else b"")
+        pipe.flush()
+        made = np.frombuffer(self._read(count * _bytes(shown(header))), np.uint8).reshape(count, -1)
+        if without := self._integers(1)[0]:
+            raise ValueError(OUTSIDE.format(without))
+        every = [a.reshape(drive.repeat, AGENTS, -1) for _, a in _cut(shown(header), made)]
+        branches = len(self.branches)
+        classes = self._integers(AGENTS * drive.choose * branches).reshape(AGENTS, drive.choose, branches)
+        sizes, unusual = self._integers(len(sized(header)) + branches + 1), self._integers(AGENTS)
+        return fetched(header, fetch, every) | {CHOSEN: classes, SIZES: sizes, UNUSUAL: unusual}
+
+    def _integers(self, count: int) -> np.ndarray:
+        return np.frombuffer(self._read(4 * count), "<i4")
 
     def __del__(self) -> None:
         process = getattr(self, "process", None)
         if process is not None:
             process.kill()
             process.wait()
+
+
+def _cut(fields: Sequence[Field], rows: np.ndarray) -> Iterator[tuple[Field, np.ndarray]]:
+    """Bytes [rows, bytes] as the fields that lie in them one after the other, [rows, size] each."""
+    at = 0
+    for f in fields:
+        size = _bytes([f])
+        yield f, np.ascontiguousarray(rows[:, at : at + size]).view(f.spec.dtype)
+        at += size
 
 
 def main() -> None:
