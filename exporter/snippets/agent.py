@@ -7,8 +7,10 @@ OnActionReceived, Heuristic); read, not compiled here.
 from __future__ import annotations
 
 import re
+import textwrap
 from collections.abc import Sequence
 
+from converters.consumers.mlagents.memory import DRAWN_KEPT
 from exporter.snippets.contract import Bundle, branch_lines, class_name, fill_template, number_names, wrap_items
 from signatures.roles import SENSOR_ORDER, Role
 from signatures.spec import TensorSpec
@@ -75,6 +77,7 @@ def _head(bundle: Bundle, sensors: list[TensorSpec], vector: TensorSpec | None) 
         lines.append(
             f"Its memory ({signature.memory.size} numbers) is kept by ML-Agents, and is empty at an episode's start."
         )
+        lines += [line for note in signature.notes if note == DRAWN_KEPT for line in textwrap.wrap(note, 110)]
     return [f"// {line}" for line in lines]
 
 

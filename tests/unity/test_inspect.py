@@ -12,6 +12,7 @@ import pytest
 from click.testing import CliRunner, Result
 from onnx import TensorProto, helper
 
+from converters.consumers.mlagents.memory import DRAWN_KEPT
 from converters.consumers.unity.checker import check_file
 from converters.consumers.unity.consumers import CONSUMERS, EARLIER
 from converters.consumers.unity.settings import Brain, sensors_of
@@ -230,3 +231,22 @@ def test_a_square_camera_in_tensorflows_order_is_taken_for_a_camera(tmp_path: Pa
 @pytest.mark.parametrize("flags", [["--logdir", "x"], ["--step", "5"], ["--trust-source"], ["--set", "a=1"]])
 def test_what_it_does_not_look_at_is_refused(flags: list[str], tmp_path: Path) -> None:
     is_refused(export_model("inspect", Draft().write(tmp_path), "--unity", "R22", *flags), flags[0], "not for --unity")
+
+
+@pytest.mark.parametrize("deterministic", [False, True])
+def test_a_memory_that_keeps_another_action_than_is_played_is_said_in_three_places(
+    tmp_path: Path, deterministic: bool
+) -> None:
+    """The last action is kept with the memory, and a memory is one, while a file has two actions."""
+    flags = ("--deterministic",) if deterministic else ()
+    made = export_model(fixture("recurrent"), "-o", tmp_path, "--for", "unity6", "--verify", "none", *flags)
+    bundle = tmp_path / "recurrent"
+    said = export_model("inspect", bundle, "--unity", "R22", "--json")
+    code = export_model("snippets", bundle, "--for", "unity6")
+    assert (made.status, said.status, code.status) == (0, 0, 0)
+    modes = {mode: said.json["verdicts"][0][mode] for mode in ("stochastic", "deterministic")}
+    warned = {mode: [p["message"] for p in verdict["played"]] for mode, verdict in modes.items()}
+    assert all(verdict["accepted"] for verdict in modes.values())
+    assert warned == {"stochastic": [], "deterministic": [] if deterministic else [DRAWN_KEPT]}
+    assert (DRAWN_KEPT in made.out) is not deterministic
+    assert ("Deterministic Inference" in code.out) is not deterministic

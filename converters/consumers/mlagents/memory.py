@@ -20,6 +20,13 @@ from converters.graph.types import FLOAT32
 from signatures.roles import Role
 from signatures.spec import Memory, TensorSpec
 
+#: Of a file with both actions, whose memory can carry one: in a note, in ``inspect --unity`` and in ``snippets``.
+DRAWN_KEPT = (
+    "the memory keeps the drawn action, and with Deterministic Inference on the other one is played: the next step "
+    "is told another last action than the one that was taken (5 to 20 of 160 decisions differed); export with "
+    "--deterministic for that"
+)
+
 Shape = Callable[[int], tuple[int | None, ...]]
 
 
@@ -69,12 +76,13 @@ def take_memory(dressing: Dressing, carried: TensorSpec | None, shape: Shape) ->
     dressing.notes.append(
         f"{dressing.profile} does not feed the last action: it is kept as the {numbers} of the memory, "
         f"so that the memory size is {size} (an old brain's Memory Size); it is the action that the file gives, "
-        + ("the deterministic one" if _is_deterministic(dressing) else "a drawn one (--deterministic keeps the other)")
+        + ("the deterministic one" if is_deterministic(dressing) else "a drawn one (--deterministic keeps the other)")
     )
     return RecurrentState(size, columns)
 
 
-def _is_deterministic(dressing: Dressing) -> bool:
+def is_deterministic(dressing: Dressing) -> bool:
+    """Whether the policy's action is the one without chance."""
     actions = [s.role for s in dressing.policy.signature.outputs if s.name in (ACTION, DISCRETE)]
     return Role.DETERMINISTIC in actions
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from converters.consumers.mlagents import input_mapping as feeding
-from converters.consumers.mlagents.memory import give_memory, previous_action, take_memory
+from converters.consumers.mlagents.memory import DRAWN_KEPT, give_memory, is_deterministic, previous_action, take_memory
 from converters.consumers.mlagents.names import CONTINUOUS, DETERMINISTIC, DISCRETE
 from converters.consumers.mlagents.naming import Dressing
 from converters.consumers.mlagents.output_mapping import branches, continuous_rows, heads, samples
@@ -54,6 +54,8 @@ def dress(policy: Policy, profile: str, *, feeds_previous: bool = True, transpos
         dressing.constants[DISCRETE_SHAPE] = np.array([scores.sizes], np.float32)
         dressing.give(DISCRETE, drawn, role, found.discrete.source)
         plain.append((DISCRETE, best))
+    if carried and not is_deterministic(dressing) and dressing.fetches[plain[-1][0]] != plain[-1][1]:
+        dressing.notes.append(DRAWN_KEPT)
     for name, without in plain:  # behind the actions, which a signature has first
         dressing.give(f"{DETERMINISTIC}{name}", without, Role.DETERMINISTIC)
     return dressing.finish(give_memory(dressing, state, _rows))

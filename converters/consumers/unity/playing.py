@@ -7,14 +7,18 @@ from typing import Any
 
 from msgspec import Struct
 
-from converters.consumers.mlagents.names import ACTION, CONTINUOUS, DISCRETE, RECURRENT_OUT
+from converters.consumers.mlagents.memory import DRAWN_KEPT
+from converters.consumers.mlagents.names import ACTION, CONTINUOUS, DETERMINISTIC, DISCRETE, RECURRENT_OUT
 from converters.consumers.unity.findings import Thrown
 from converters.consumers.unity.forms import fields
 from converters.consumers.unity.layers import trips
+from converters.consumers.unity.onnx_file import OnnxFile
 from converters.consumers.unity.players import ANY, FED, OBSERVATION, ONE_NUMBER, PLAYERS, UNKNOWN, Outcome, Player, Row
 from converters.consumers.unity.rules import culture_key
 from converters.consumers.unity.scene import Port, Scene
 
+#: Operators that compute nothing.
+_MOVES = frozenset({"Cast", "Concat", "Flatten", "Identity", "Reshape", "Slice", "Squeeze", "Unsqueeze"})
 _ABSENT = "mem_out_missing, cont_missing_drawn, disc_missing_drawn"
 
 
@@ -62,6 +66,7 @@ def play(scene: Scene) -> tuple[Played, ...]:
         *_absent(scene, player),
         *_outputs(scene, player),
         *_kinds(scene),
+        *_kept_action(scene),
         *_layers(scene),
     ]
     order = list(Outcome)
@@ -154,3 +159,30 @@ def _kinds(scene: Scene) -> Iterator[Played]:
                 f"output {kind}",
                 f"give the file {kind} for this mode, or take them off the agent",
             )
+
+
+def _kept_action(scene: Scene) -> Iterator[Played]:
+    """A memory with the last action in it, where that is another than the one that is played."""
+    if scene.file is None or RECURRENT_OUT not in scene.fetched:
+        return
+    kept = _parts(scene.file, RECURRENT_OUT)
+    for kind in (CONTINUOUS, DISCRETE):
+        plain = f"{DETERMINISTIC}{kind}"
+        if plain in scene.fetched and kept & _parts(scene.file, kind) and not kept & _parts(scene.file, plain):
+            yield Played(
+                Outcome.WARNS, DRAWN_KEPT, f"output {RECURRENT_OUT}", "leave it off, or export with --deterministic"
+            )
+
+
+def _parts(file: OnnxFile, name: str) -> set[str]:
+    """What a value is put together from, itself included, as far as no number is computed; constants left out."""
+    found, waiting = set[str](), [name]
+    while waiting:
+        value = waiting.pop()
+        if value in found or not value or file.is_constant(value):
+            continue
+        found.add(value)
+        node = file.producers.get(value)
+        if node is not None and node.op_type in _MOVES:
+            waiting.extend(node.input)
+    return found
