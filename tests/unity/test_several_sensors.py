@@ -21,6 +21,7 @@ from converters.consumers.unity.consumers import CONSUMERS
 from converters.consumers.unity.onnx_file import OnnxFile
 from converters.consumers.unity.settings import Brain, Sensor
 from exporter import export_model
+from signatures.errors import ProfileError
 from tests.unity.conftest import ABSENT, UNITY, lines
 
 #: A ``.pt`` alone does not say which columns are whose sensor: ``--sensors`` has tests of its own.
@@ -127,3 +128,21 @@ def test_what_hangs_behind_a_turned_convolution_is_channels_last(nodes: list[Any
     file = drawn(*nodes)
     assert keeps_last(file) == kept
     assert channel_orders(file)["seen"] is Order.NATIVE
+
+
+def test_an_attention_whose_heads_lie_on_an_axis_of_their_own_is_refused_by_name(tmp_path: Path) -> None:
+    """The twin of foreign/entity_attention: 3.0.0 did not import its file, nor was one of five axes ever read."""
+    source = UNITY.parent / "foreign" / "entity_attention__legacy.onnx"
+    if not source.is_file():
+        pytest.skip(ABSENT)
+    model = onnx.load(source)
+    (node,) = (n for n in model.graph.node if n.name == "/a/Reshape_8")
+    node.input[1] = "shape"  # the masks' shape as a constant, which the other writer of the module gives
+    model.graph.initializer.append(numpy_helper.from_array(np.array([-1, 2, 1, 7]), "shape"))
+    onnx.save(model, tmp_path / "twin.onnx")
+    with pytest.raises(ProfileError) as refused:
+        export_model(tmp_path / "twin.onnx", tmp_path / "out", for_="barracuda-3", to="onnx", verify="none")
+    assert "more than four axes" in str(refused.value)
+    assert export_model(tmp_path / "twin.onnx", tmp_path / "out", for_="unity6", verify="none")
+    verdict = check_file(next((tmp_path / "out").rglob("*.onnx")), CONSUMERS["R20"])
+    assert verdict.refused is not None and verdict.refused.exception == "ArgumentOutOfRangeException"

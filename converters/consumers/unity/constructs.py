@@ -18,6 +18,8 @@ from signatures.errors import DamagedFileError
 
 #: The pseudo-operators that an output and an input of the model are listed as.
 OUTPUT, INPUT = "(output)", "(input)"
+#: Axes of a tensor that an importer of Barracuda was seen to read.
+MOST_AXES = 4
 _STANDARD = ("", "ai.onnx")
 
 
@@ -70,6 +72,12 @@ class Construct(Struct, frozen=True):
     def attribute(self, name: str, default: Any = None) -> Any:
         """An attribute as a Python value."""
         return self.attributes.get(name, default)
+
+    @property
+    def axes(self) -> int:
+        """The most axes of its first operand, and of the shape that a Reshape gives it."""
+        target = self.operand(1).value if self.op == "Reshape" else None
+        return max(self.operand(0).rank or 0, 0 if target is None else target.size)
 
     @property
     def given_out(self) -> bool:

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from converters.consumers.mlagents.names import RECURRENT_IN
+from converters.consumers.unity.constructs import MOST_AXES
 from converters.consumers.unity.consumers import Consumer, Engine
 from converters.consumers.unity.findings import Thrown, null_reference
 from converters.consumers.unity.onnx_file import OnnxFile, attributes
@@ -86,6 +87,14 @@ def _by_barracuda(file: OnnxFile) -> Iterator[Thrown]:
                 f"Must have input rank for {node.input[0]} in order to convert Flatten to NHWC",
                 f"node {layer} (Flatten)",
                 "write a Reshape; --for barracuda-3 does",
+            )
+        if len(file.shapes.get(layer, ())) > MOST_AXES:
+            yield Thrown(
+                "ArgumentOutOfRangeException",
+                "the shapes of a tensor of more than four axes are not told (seen of an attention over entities)",
+                f"node {layer} ({node.op_type})",
+                "write a .nn, or export for a later consumer",
+                worded=False,
             )
         why = _refusal_of(file, node, layer)
         if why is not None:

@@ -14,7 +14,7 @@ from enum import StrEnum
 import numpy as np
 from msgspec import Struct
 
-from converters.consumers.unity.constructs import INPUT, OUTPUT, Construct, Model, Operand, Source
+from converters.consumers.unity.constructs import INPUT, MOST_AXES, OUTPUT, Construct, Model, Operand, Source
 from converters.consumers.unity.importers import (
     BARRACUDA,
     BEFORE_2_3,
@@ -379,9 +379,9 @@ def _rules() -> Iterator[Rule]:
     yield Rule(("Gather",), fails, BARRACUDA, "a negative index", "Gather_04", _negative(1))
     table = _all(lambda c: c.operand(0).source is Source.CONSTANT)
     yield Rule(("Gather",), refused, FIRST, "rows of a constant table", "Gather_05", table)
-    unnamed = _all(
-        lambda c: c.attribute("perm") is None and _rank(c.operand(0)) == 2 and not c.operand(0).value is not None
-    )
+    unnamed = _all(lambda c: c.attribute("perm") is None and _rank(c.operand(0)) == 2 and c.operand(0).value is None)
+    wide = "of more than four axes (seen in 3.0.0; no other was tried)"
+    yield Rule(("Reshape", "Transpose"), refused, BARRACUDA, wide, "r4, entity_attention", lambda c: c.axes > MOST_AXES)
     yield Rule(("Transpose",), wrong, LATER, "of rank 2 without perm, batch above 1", "Transpose_02", unnamed)
     swapped = _all(lambda c: c.attribute("perm") == [1, 0, 2])
     yield Rule(("Transpose",), wrong, FIRST, "of rank 3, batch above 1", "Transpose_04", swapped)
