@@ -12,16 +12,20 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from converters.compiler.passes.weights import Storage
 from converters.files import tensorflow_messages as schema
+from converters.formats.bundle.embed import runnable
 from converters.formats.format import WriteOptions
+from converters.formats.frozen_graph.reader import read_graph
 from converters.formats.registry import WRITTEN
+from converters.formats.saved_model.artifact import graph
 from converters.graph.run import run_graph
 from converters.policy.policy import Policy
 from converters.runtimes.pool import RuntimePool
 from exporter.export.pipeline import ExportOptions, ExportResult, export
 from exporter.export.sources import read_source
 from exporter.reports.summary import failure_lines
-from fixtures import FIXTURES
+from fixtures import FIXTURES, FOLDER
 from fixtures import path as fixture
 from signatures.contract import EMBEDDED, Contract, Origin, safe_name
 from signatures.errors import BundleError, DamagedFileError, ExportModelError
@@ -65,6 +69,25 @@ def test_the_contract_is_kept(name: str, form: str, tmp_path: Path) -> None:
         assert_same(policy, result.policy)
         assert policy.source.feeds.keys() == result.policy.source.feeds.keys()
         assert set(policy.source.feeds.values()) == {f"{s.name}:0" for s in policy.signature.inputs}
+
+
+@pytest.mark.parametrize("source", ["recurrent.bytes", "sb3_zip/ppo_box.zip", "torch_checkpoint/ppo_0_22_lstm.pt"])
+@pytest.mark.parametrize("weights", ["float32", "float16"])
+def test_what_is_written_for_converters_is_the_same_to_the_bit(source: str, weights: Storage, tmp_path: Path) -> None:
+    """Biases that are subtracted, sums of two products, one-hot rows; read back, biases are added again."""
+    options = ExportOptions(tmp_path, targets=WITHOUT_ONNX, verify="none", weights=weights)
+    (result,) = export([FOLDER / source], options)
+    whole = read_graph((result.folder / f"{result.policy.name}.bytes").read_bytes())
+    written = graph(result.folder / "saved_model")
+    assert [n.op for n in written.nodes] != [n.op for n in whole.nodes]
+    names = [s.name for s in result.policy.signature.outputs if s.role is not Role.SAMPLED]
+    for case in draw_cases(result.policy.signature, seed=1, samples=1):
+        one, two = (run_graph(runnable(g), case.feeds, names) for g in (whole, written))
+        for name in names:
+            np.testing.assert_array_equal(one[name], two[name])
+    if weights == "float32":
+        (again,) = read_source(result.folder / "saved_model").policies()
+        assert not {n.op for n in again.graph.nodes} & {"Sub"} - {n.op for n in whole.nodes}
 
 
 @pytest.mark.corpus
