@@ -25,6 +25,7 @@ from converters.files.folders import scratch_folder, size_of
 from converters.formats.source import OriginalRun, ReadOptions
 from converters.policy.policy import Policy
 from converters.runtimes.pool import RuntimePool, chosen_runtimes
+from exporter.compare.explaining import Explaining
 from exporter.compare.matching import AnyCandidate, Candidate, match_candidates
 from exporter.compare.reading import ReadCandidate, read_participants
 from exporter.compare.weights import compare_rounded, merge_reports, rounded_to
@@ -48,7 +49,7 @@ from exporter.verify.reference import random_outputs
 from exporter.verify.report import ParityReport
 from exporter.verify.session import Session
 from exporter.verify.tolerances import Tolerance, check_rules
-from exporter.verify.verification import Judge, verify
+from exporter.verify.verification import CHECKS, Judge, verify
 from signatures.errors import RuntimeUnavailableError, UsageError, naming
 from signatures.sampling import draw_cases
 
@@ -81,13 +82,13 @@ def compare_artefacts(
     progress: Progress = _LOG.info,
     understood: Callable[[Policy], object] | None = None,
     pool: RuntimePool | None = None,
-    judge: Judge = verify,
+    judge: Judge | None = None,
 ) -> ParityReport:
     """Compare files that any tool made with a reference; every format of a candidate that is a bundle takes part.
 
     - ``progress``: called with each step; the default logs them.
     - ``understood``: called with the reference as it was understood, before anything runs.
-    - ``judge``: what is made of the candidates' participants, in place of a verification.
+    - ``judge``: what is made of the candidates' participants, in place of a verification that names what differs.
 
     Raises ExportModelError where a file cannot be read, UsageError where a name of ``names`` is none,
     RuntimeUnavailableError where no runtime could run any.
@@ -109,11 +110,15 @@ def compare_artefacts(
         _check_options(judging, policy, matched, used)
         running = opened.enter_context(RuntimePool()) if pool is None else pool
         session = Session(used, known, running, judging, progress)
+        explaining = Explaining()
+        judge = judge or partial(verify, checks=(*CHECKS, explaining))
         comparison = _Comparison(policy, source, session, judge, Path(opened.enter_context(scratch_folder())))
         report = comparison.report(matched, rounded_to(reference))
     notes = [note for m in matched for note in m.notes(policy, used)]
     ran = any(isinstance(m, Candidate) or m.place(used)[0] is None for m in matched)
-    report = replace(report, notes=(*report.notes, *notes), self_consistent=report.self_consistent and not ran)
+    report = replace(
+        report, notes=(*report.notes, *notes, *explaining.notes), self_consistent=report.self_consistent and not ran
+    )
     if report.passed is None and not report.undecided and not (options.allow_unverified or judging.runtimes == "none"):
         raise RuntimeUnavailableError(
             "no runtime that runs the candidates is installed, so nothing was compared",

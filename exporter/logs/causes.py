@@ -351,7 +351,8 @@ def action_causes(name: str, logged: Array, computed: Array) -> list[Cause]:
     """Changes of an action of numbers, [steps, columns], read off the log: swapped, scaled, moved, clipped columns."""
     if len(logged) < FEWEST:
         return []
-    return [*_scaled_action(name, logged, computed), *_clipped_action(name, logged, computed)]
+    changes = (_scaled_action, _clipped_action, _squashed_action)
+    return [cause for change in changes for cause in change(name, logged, computed)]
 
 
 def _of(rows: Array, computed: Array) -> Array:
@@ -403,3 +404,13 @@ def _clipped_action(name: str, logged: Array, computed: Array) -> Iterator[Cause
         bound = max(abs(float(low[beyond].min())), abs(float(high[beyond].max())))
         says = f"the action was clipped to ±{bound:.4g} before it was logged"
         yield Cause("clip", name, says, output=name, answers=lambda a, r: np.clip(a, low, high))
+
+
+def _squashed_action(name: str, logged: Array, computed: Array) -> Iterator[Cause]:
+    """An action that went through tanh on one side only."""
+    if np.abs(logged).max() <= 1:
+        says = "what was logged is the tanh of the policy's action"
+        yield Cause("squash", name, says, output=name, answers=lambda a, r: np.tanh(a))
+    if np.abs(computed).max() < 1:
+        says = "the policy's action is the tanh of what was logged"
+        yield Cause("squash", name, says, output=name, answers=lambda a, r: np.arctanh(np.clip(a, -1, 1)))

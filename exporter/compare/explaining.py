@@ -1,0 +1,154 @@
+"""What a candidate's actions are of the reference's, where they differ: by the table of causes of an agent's log.
+
+The candidate's answers to typical observations are taken for what an agent of the reference logged, and the other way
+round; the cause that makes every step fit (exporter/logs/causes.py) says what differs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+
+from exporter.logs.judging import LOG_TOLERANCE, targets_of
+from exporter.logs.recording import NONE, Array, Recording
+from exporter.logs.replay import Replay
+from exporter.logs.search import Explanation, explain
+from exporter.logs.trials import Trials
+from exporter.verify.findings import Finding
+from exporter.verify.participants import Feeds, Participant, Run
+from exporter.verify.trial import Trial
+from signatures.roles import Role
+from signatures.sampling import draw_rollout
+from signatures.spec import PolicySignature
+
+#: Episodes side by side, and steps of each.
+_EPISODES, _STEPS = 16, 16
+
+
+#: kind of a cause → what it does, after the tensor that it is done to.
+_CHANGES = {
+    "memory": "used otherwise",
+    "previous_action": "left out",
+    "mask": "read otherwise",
+    "image": "laid out otherwise",
+    "normaliser": "normalised otherwise",
+    "stated_scale": "scaled otherwise",
+    "clip": "clipped",
+    "squash": "squashed otherwise",
+    "unit": "scaled",
+    "scale": "scaled",
+    "offset": "moved",
+    "swap": "exchanged",
+    "order": "in another order",
+    "action_scale": "scaled",
+    "action_offset": "moved",
+    "lag": "a step apart",
+}
+
+
+class Explaining:
+    """A check that finds nothing wrong by itself: ``notes`` gets a sentence where one cause explains a difference."""
+
+    def __init__(self) -> None:
+        self.notes: list[str] = []
+
+    def __call__(self, trial: Trial, participant: Participant) -> Iterator[Finding]:
+        """Explain what a participant's actions are, if they are not the reference's."""
+        heads = _shared_actions(trial, participant)
+        if heads:
+            self.notes += _explanations(trial, participant, heads)
+        yield from ()
+
+
+def _shared_actions(trial: Trial, participant: Participant) -> dict[str, str]:
+    """Head → an output that has it without chance, where both sides have one: made for it, or its own without noise."""
+    actions = {}
+    for head in trial.signature.heads:
+        outputs = (head.name,) if head.plain is None else (head.plain.name, head.name)
+        able = [n for n in outputs if n in participant.outputs and not trial.is_drawn(n, participant)]
+        if able and trial.signature.output(able[0]).role in (Role.CONTINUOUS, Role.DETERMINISTIC):
+            actions[head.name] = able[0]
+    return actions
+
+
+def _explanations(trial: Trial, participant: Participant, heads: Mapping[str, str]) -> Iterator[str]:
+    signature, label = trial.signature, participant.name
+    pair = signature.recurrence
+    if pair is not None and pair[1] not in participant.outputs:
+        return
+    steps = draw_rollout(signature, seed=trial.options.seed, steps=_STEPS, batch=_EPISODES)
+    for feeds in steps:  # without chance
+        feeds.update({s.name: np.zeros_like(feeds[s.name]) for s in signature.noise})
+    fetch = [*heads.values(), *(pair[1:] if pair else ())]
+    runs: dict[str, Run] = {"candidate": participant.run, "reference": trial.reference.run}
+    logs = {
+        side: _recording(signature, steps, _play(signature, steps, run, fetch), heads) for side, run in runs.items()
+    }
+    for side, other in (("candidate", "reference"), ("reference", "candidate")):
+        answered = [s.name for s in signature.outputs] if other == "reference" else participant.outputs
+        found = _explain(signature, runs[other], answered, logs[side])
+        if found is not None and found.whole:
+            yield f"{label}: the {side} is the {other} with {', '.join(_phrases(found))}"
+            return
+
+
+def _phrases(found: Explanation) -> Iterator[str]:
+    for cause in found.causes:
+        others = [c.where for c in found.others if c.kind == cause.kind][:2]
+        also = f", or {', '.join(others)}" if others else ""
+        yield f"{cause.where} {_CHANGES[cause.kind]} ({cause.says}{also})"
+
+
+def _play(
+    signature: PolicySignature, steps: Sequence[Feeds], run: Run, fetch: Sequence[str]
+) -> list[Mapping[str, Array]]:
+    """The answers to each step, the memory fed back."""
+    answers: list[Mapping[str, Array]] = []
+    for feeds in steps:
+        carried = signature.fed_back(answers[-1]) if answers else {}
+        answers.append(run([{**feeds, **carried}], fetch)[0])
+    return answers
+
+
+def _recording(
+    signature: PolicySignature, steps: Sequence[Feeds], answers: Sequence[Mapping[str, Array]], heads: Mapping[str, str]
+) -> Recording:
+    """The steps as an agent's log has them: those of one episode in a row."""
+    memories = {s.name for s in signature.inputs if s.role is Role.MEMORY_IN}
+    batched = [s.name for s in signature.inputs if s.batched and s.name not in memories]
+    inputs: dict[str, Array] = {n: np.concatenate([feeds[n] for feeds in steps]) for n in batched}
+    inputs |= {s.name: steps[0][s.name] for s in signature.inputs if not s.batched}
+    outputs = {}
+    for head, name in heads.items():
+        values = np.concatenate([answer[name] for answer in answers])
+        outputs[head] = values.reshape(len(values), -1) if values.dtype.kind in "iu" else values.astype(np.float64)
+    rows = len(steps) * _EPISODES
+    before = np.maximum(np.arange(rows) - _EPISODES, NONE)
+    return Recording(
+        inputs=inputs,
+        outputs=outputs,
+        before=before,
+        last=before,
+        episodes=_EPISODES,
+        logged=frozenset(inputs),
+        chained=bool(memories),
+        episode=np.zeros(rows, np.int64),
+        agent=np.tile(np.arange(_EPISODES), len(steps)),
+    )
+
+
+def _explain(signature: PolicySignature, run: Run, answered: Sequence[str], recording: Recording) -> Explanation | None:
+    """What makes the steps those of the policy that ``run`` runs; None where they are, or nothing does.
+
+    ``answered`` are the outputs that it can be asked for.
+    """
+    targets = targets_of(signature, recording, draws_itself=False)
+    pair = signature.recurrence
+    names = dict.fromkeys([*(n for t in targets for n in t.output_names), *(pair[1:] if pair else ())])
+    if not set(names) <= set(answered):
+        return None
+    replay = Replay(lambda feeds, fetch: run([feeds], fetch)[0], signature, tuple(names))
+    trials = Trials(replay, recording, targets, LOG_TOLERANCE, drawn=False)
+    base = trials.verdict()
+    return None if base.fits else explain(trials, base)
