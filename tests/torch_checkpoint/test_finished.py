@@ -24,12 +24,21 @@ NAMES = sorted(path.stem for path in FOLDER.glob("*.npz"))
 DTYPES = ("f2", "f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "?", ">f8", ">i4")
 
 
+def placed(name: str, folder: Path) -> Path:
+    """The checkpoint and the settings of its run."""
+    if name == "rllib":
+        for file, short in (("class_and_ctor_args", "arguments"), ("module_state", "state")):
+            shutil.copy(FOLDER / f"rllib.{short}.pkl", folder / f"{file}.pkl")
+        return folder
+    if (settings := FOLDER / f"{name}.yaml").exists():
+        shutil.copy(settings, folder / "agent.yaml")
+    (checkpoint,) = (path for path in FOLDER.glob(f"{name}.*") if path.suffix in (".pt", ".pth", ".zip"))
+    return Path(shutil.copy(checkpoint, folder))
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_a_run_that_ended_is_read_and_acts_as_its_trainer(name: str, tmp_path: Path) -> None:
-    (checkpoint,) = (path for path in FOLDER.glob(f"{name}.*") if path.suffix in (".pt", ".pth", ".zip"))
-    path = Path(shutil.copy(checkpoint, tmp_path))
-    if (settings := FOLDER / f"{name}.yaml").exists():
-        shutil.copy(settings, tmp_path / "agent.yaml")
+    path = placed(name, tmp_path)
     told = ReadOptions(activation="elu") if name == "rsl_rl" else ReadOptions()
     (policy,) = read_source(path, told).policies()
     golden = read_npz(FOLDER / f"{name}.npz")
