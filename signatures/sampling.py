@@ -4,13 +4,13 @@ Around the statistics of its own normaliser where it has one, at the edges (zero
 from the others, float32 denormals, every two inputs at opposite extremes, a memory far from zero), each action masked
 alone and all but one, each id of a table, the patterns that observations have (one number alone, zeros and ones …),
 images in 0..1, dim and bright, pixels at their ends, with structure (signatures/pictures.py), batches of 1 to 7, of 16,
-32, 48 and 64, and an odd one above 512 (a smaller one of large images).
+10, 12, 32, 48 and 64, and an odd one above 512 (a smaller one of large images); of vectors alone, one of 4,096.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import TypeAlias
 
 import numpy as np
@@ -25,6 +25,8 @@ from signatures.spec import PolicySignature, TensorSpec
 BATCHES = (1, 2, 7)
 #: Tried once; with images, which take long, the largest whose pixels are no more than these.
 LARGE_BATCH = 521
+#: Tried once with vectors alone, and in one runtime of each format.
+HUGE_BATCH = 4096
 LARGE_BATCHES_OF_IMAGES = (67, 33, 17, 9)
 MAX_PIXELS = 1 << 21
 #: Rows of each batch of ``draw_typical``.
@@ -35,7 +37,7 @@ PATTERN_BATCHES_OF_IMAGES = (32, 64)
 EXTREMES = ((5.0, 5.0), (2.5, 4.0), (5.5, 8.0))
 FAR = ((8.0, 30.0), (30.0, 100.0), (100.0, 300.0), (300.0, 1e3), (1e3, 1e4))
 #: The inputs that are far: float32 alone may make a difference there.
-FAR_CASES = ("opposite extremes", "8 to 1e4", "one number far away")
+FAR_CASES = ("opposite extremes", "8 to 1e4", "one number far away", "masks, 8 to 1e4")
 #: Its first two rows together forbid every action, but for the only one of a branch.
 ONE_ALLOWED = "all but one action masked"
 #: A row for each action that alone is forbidden, then some for two.
@@ -82,40 +84,52 @@ def draw_cases(signature: PolicySignature, *, seed: int = 0, samples: int = 2) -
         for batch in BATCHES
         for i in range(samples)
     ]
-    edges = (("zeros", _zeros), ("clip edges", _clip_edges), ("beyond the clip", _beyond), ("1e3", _large))
-    for name, style in (*edges, ("denormals", _denormals)):
-        cases.append(_case(signature, rng, name, 2, style))
+    cameras = any(s.role is Role.VISUAL for s in signature.inputs)
+    edges = (("zeros", 2, _zeros), ("clip edges", 10, _clip_edges), ("beyond the clip", 12, _beyond))
+    for name, batch, style in (*edges, ("1e3", 2, _large), ("denormals", 2, _denormals)):
+        cases.append(_case(signature, rng, name, 2 if cameras else batch, style))
+    free = any(_is_free(s) for s in signature.inputs)
     if any(s.role is Role.MASKS for s in signature.inputs):
         cases.append(_case(signature, rng, ONE_ALLOWED, 7, _typical, masks=one_allowed))
         cases.append(_case(signature, rng, "random masks", 7, _typical, masks=random_masks))
+        if free:
+            far = _far(signature, few=True)
+            cases.append(_case(signature, rng, "masks, 8 to 1e4", 2 * len(FAR), far, masks=random_masks))
         without = 1 - forbidden(signature, rng)
         if len(without):
             given = _case(signature, rng, ONE_FORBIDDEN, len(without), _typical, masks=lambda *_: without)
             cases.append(given)
     if (ids := _ids(signature)) > 1:
         cases.append(_case(signature, rng, EVERY_ID, ids, _each_id))
+    if cameras:
+        return [*cases, *_beside_images(signature, rng)]
     large = _large_batch(signature)
-    if any(s.role is Role.VISUAL for s in signature.inputs):
-        cases.append(_case(signature, rng, "pixels at their ends", 3, _typical, pixels=_ends))
-        cases.append(_case(signature, rng, f"typical, batch {large}", large, _typical, pixels=_dim_and_bright))
-        if any(_is_free(s) for s in signature.inputs):
-            pattern = len(_opposite_signs(signature))
-            if pattern * _pixels(signature) <= MAX_PIXELS:
-                cases.append(_case(signature, rng, "opposite extremes", pattern, _opposite(signature, EXTREMES[:1])))
-            cases.append(_case(signature, rng, "8 to 1e4", len(FAR), _far(signature, few=True)))
-        pixels = _pixels(signature)
-        for batch in (n for n in PATTERN_BATCHES_OF_IMAGES if n * pixels <= MAX_PIXELS) if pixels else ():
-            name = f"images with structure, batch {batch}"
-            cases.append(_case(signature, rng, name, batch, _every_pattern, pixels=_image_sampler(batch)))
-        return cases
     cases.append(_case(signature, rng, f"typical, batch {large}", large, _typical))
-    if any(_is_free(s) for s in signature.inputs):
+    if free:
         pattern = len(_opposite_signs(signature))
         cases.append(_case(signature, rng, "opposite extremes", pattern * len(EXTREMES), _opposite(signature)))
         cases.append(_case(signature, rng, "8 to 1e4", 2 * pattern * len(FAR), _far(signature)))
         cases.append(_case(signature, rng, "one number far away", _FEW_FAR, _one_far))
     cases += [_case(signature, rng, name, batch, style) for name, batch, style in _PATTERNS]
+    if all(len(s.shape) == 2 for s in signature.observations):
+        cases.append(_case(signature, rng, f"typical, batch {HUGE_BATCH}", HUGE_BATCH, _typical))
     return cases
+
+
+def _beside_images(signature: PolicySignature, rng: np.random.Generator) -> Iterator[Case]:
+    """What a policy that sees images is tried with, and beside them the edges of what else it sees."""
+    large, pixels = _large_batch(signature), _pixels(signature)
+    yield _case(signature, rng, "pixels at their ends", 3, _typical, pixels=_ends)
+    yield _case(signature, rng, f"typical, batch {large}", large, _typical, pixels=_dim_and_bright)
+    if any(_is_free(s) for s in signature.inputs):
+        most = max(2, MAX_PIXELS // max(1, pixels))
+        pattern = min(most, len(_opposite_signs(signature)))
+        yield _case(signature, rng, "opposite extremes", pattern, _opposite(signature, EXTREMES[:1]))
+        yield _case(signature, rng, "8 to 1e4", len(FAR), _far(signature, few=True))
+        yield _case(signature, rng, "one number far away", min(most, _FEW_FAR_BESIDE_IMAGES), _one_far)
+    for batch in (n for n in PATTERN_BATCHES_OF_IMAGES if n * pixels <= MAX_PIXELS) if pixels else ():
+        name = f"images with structure, batch {batch}"
+        yield _case(signature, rng, name, batch, _every_pattern, pixels=_image_sampler(batch))
 
 
 def draw_typical(signature: PolicySignature, *, seed: int, count: int) -> list[Case]:
@@ -320,7 +334,7 @@ _PATTERNS: tuple[tuple[str, int, Style], ...] = (
     ("from zero to one", 64, _unit),
 )
 #: Rows of which each has one number far away.
-_FEW_FAR = 48
+_FEW_FAR, _FEW_FAR_BESIDE_IMAGES = 48, 24
 
 
 def _every_pattern(rng: np.random.Generator, spec: TensorSpec, shape: tuple[int, ...]) -> np.ndarray:

@@ -64,6 +64,8 @@ class Trial:
         self.choices = Choices(tested.graph)
         self._cost = 0
         self._allowances: dict[tuple[str, str], Allowance] = {}
+        #: format → the runtime that is given the dearest input
+        self._first: dict[str, str] = {}
         #: files that were started twice, to see whether they draw alike
         self.started: set[Path] = set()
         self.expected: list[Arrays] = []
@@ -98,6 +100,10 @@ class Trial:
             self._cost = self._cost or products(self.tested.graph)
             self._allowances[key] = Allowance(self._cost, participant.runtime)
         return self._allowances[key]
+
+    def first_of(self, participant: Participant) -> bool:
+        """Whether this runtime is the first of its format."""
+        return self._first.setdefault(participant.name, participant.runtime) == participant.runtime
 
     def notes(self) -> list[str]:
         """What was left out, for the report, and what could not be fed."""
