@@ -7,7 +7,7 @@ one kind; the order is that in which two that explain as much are named.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from itertools import combinations, pairwise
 
 import numpy as np
@@ -143,16 +143,31 @@ def _previous(signature: PolicySignature, recording: Recording) -> Iterator[Caus
 def _masks(signature: PolicySignature, recording: Recording) -> Iterator[Cause]:
     for spec in signature.inputs:
         if spec.role is Role.MASKS and spec.name in recording.logged:
-            if _leaves_actions(1 - recording.inputs[spec.name], signature.branches):
-                yield Cause("mask", spec.name, "the mask was inverted", on(spec.name, lambda a: 1 - a))
+            yield from _inverted(spec.name, signature, recording)
             if (recording.inputs[spec.name] < 1).any():
                 yield Cause("mask", spec.name, "the mask was not applied", on(spec.name, np.ones_like))
 
 
-def _leaves_actions(masks: Array, branches: Sequence[int]) -> bool:
-    """Whether every step has an action of each branch that is allowed: of none, every choice would fit."""
-    edges = np.cumsum((0, *branches)).tolist()
-    return all(bool((masks[:, a:b] > 0).any(axis=1).all()) for a, b in pairwise(edges))
+def _inverted(name: str, signature: PolicySignature, recording: Recording) -> Iterator[Cause]:
+    """The mask the other way round, which says nothing of the steps that it would leave no action."""
+
+    def decided(masks: Array) -> Array:
+        edges = np.cumsum((0, *signature.branches)).tolist()
+        return np.asarray(np.all([(masks[:, a:b] < 1).any(axis=1) for a, b in pairwise(edges)], axis=0))
+
+    if decided(recording.inputs[name]).sum() < FEWEST:
+        return
+    heads = [head.name for head in signature.heads if not head.is_continuous and head.name in recording.outputs]
+    change = on(name, lambda a: np.where(decided(a)[:, None], 1 - a, a))
+    for head in heads[:1]:
+        yield Cause(
+            "mask",
+            name,
+            "the mask was inverted",
+            change,
+            output=head,
+            answers=lambda a, r: np.where(decided(r.inputs[name])[:, None], a, np.nan),
+        )
 
 
 def _normaliser(signature: PolicySignature, recording: Recording) -> Iterator[Cause]:

@@ -20,6 +20,8 @@ LOG_TOLERANCE = Tolerance(1e-4, 1e-4, "a log is of another machine")
 BEYOND = 1e12
 #: Of draws: how many standard deviations their log-likelihood may be from what is expected (two-sided p = 6e-7).
 SIGMAS = 5.0
+#: As near the mean as one draw of a hundred is, in standard deviations: more of them were not drawn, or only some.
+NEAR, NEAR_ODDS = 0.0125, 0.00997
 #: A class that the policy gives less than this log-probability is never drawn.
 NEVER = -18.4
 #: A Gaussian whose mean is so many deviations within the bounds is as good as never clipped (1e-4).
@@ -158,7 +160,8 @@ class Clip(Struct, frozen=True):
 class Likelihood(Struct, frozen=True):
     """The log-likelihood of what was drawn in each step, what is expected of it, and its variance: float64 [steps].
 
-    Of choices also whether the likeliest was taken, less its odds, and the variance of that.
+    Of choices also whether the likeliest was taken, less its odds, and the variance of that; of numbers how many of
+    those that were ``counted`` lie ``near`` the mean.
     """
 
     found: Array
@@ -166,6 +169,8 @@ class Likelihood(Struct, frozen=True):
     variance: Array
     likeliest: Array
     likeliest_variance: Array
+    near: Array
+    counted: Array
 
     @property
     def sigmas(self) -> float:
@@ -173,6 +178,7 @@ class Likelihood(Struct, frozen=True):
         both = (
             _sigmas(float((self.found - self.expected).sum()), float(self.variance.sum())),
             _sigmas(float(self.likeliest.sum()), float(self.likeliest_variance.sum())),
+            _too_many(float(self.near.sum()), float(self.counted.sum()), NEAR_ODDS),
         )
         return max(both, key=abs)
 
@@ -183,8 +189,7 @@ class Likelihood(Struct, frozen=True):
 
     def without(self, rows: Array) -> Likelihood:
         """The same, with nothing said of the steps ``rows``, bool [steps]."""
-        parts = (self.found, self.expected, self.variance, self.likeliest, self.likeliest_variance)
-        return Likelihood(*(np.where(rows, 0.0, part) for part in parts))
+        return Likelihood(*(np.where(rows, 0.0, getattr(self, part)) for part in self.__struct_fields__))
 
 
 def _sigmas(apart: float, variance: float) -> float:
@@ -193,6 +198,15 @@ def _sigmas(apart: float, variance: float) -> float:
     if variance < 1e-9:
         return 0.0 if abs(apart) < 1e-3 else math.copysign(BEYOND, apart)
     return apart / math.sqrt(variance)
+
+
+def _too_many(found: float, count: float, odds: float) -> float:
+    """How improbable so many of ``count`` are (Chernoff's bound), as standard deviations of a Gaussian."""
+    share = found / max(count, 1.0)
+    if share <= odds:
+        return 0.0
+    rest = (1 - share) * math.log((1 - share) / (1 - odds)) if share < 1 else 0.0
+    return math.sqrt(2 * count * (share * math.log(share / odds) + rest))
 
 
 def likelihood(
@@ -217,7 +231,7 @@ def likelihood(
 
 
 def _of_classes(target: Target, choices: Array, scores: Array) -> Likelihood:
-    found, expected, variance, likeliest, spread = (np.zeros(len(scores)) for _ in range(5))
+    found, expected, variance, likeliest, spread, none = (np.zeros(len(scores)) for _ in range(6))
     for part, chosen in _by_branch(target, scores, choices):
         shifted = part - part.max(axis=1, keepdims=True)
         logs = np.maximum(shifted - np.log(np.exp(shifted).sum(axis=1, keepdims=True)), 4 * NEVER)
@@ -229,7 +243,7 @@ def _of_classes(target: Target, choices: Array, scores: Array) -> Likelihood:
         most = odds.max(axis=1)
         likeliest += (odds.argmax(axis=1) == chosen) - most
         spread += most * (1 - most)
-    return Likelihood(found, expected, np.maximum(variance, 0.0), likeliest, spread)
+    return Likelihood(found, expected, np.maximum(variance, 0.0), likeliest, spread, near=none, counted=none)
 
 
 def measured_spread(target: Target, answers: Arrays, moved: Sequence[Arrays], bounds: Array) -> Array:
@@ -263,8 +277,9 @@ def _of_numbers(drawn: Array, mean: Array, std: Array, clip: Clip | None) -> Lik
     # Where clipping is likely, the test leaves an element out whether it was clipped or not; weighing causes does not.
     counted = known & free & ((high - mean) / std > CLIP_SIGMAS) & ((mean - low) / std > CLIP_SIGMAS)
     expected = np.where(counted, -np.log(std) - 0.5 * math.log(2 * math.pi) - 0.5, found)
-    none = np.zeros(len(mean))
-    return Likelihood(found.sum(axis=1), expected.sum(axis=1), 0.5 * counted.sum(axis=1).astype(np.float64), none, none)
+    none, size = np.zeros(len(mean)), counted.sum(axis=1).astype(np.float64)
+    near = (counted & (np.abs(z) < NEAR)).sum(axis=1).astype(np.float64)
+    return Likelihood(found.sum(axis=1), expected.sum(axis=1), 0.5 * size, none, none, near=near, counted=size)
 
 
 def _log_tail(x: Array) -> Array:

@@ -224,7 +224,21 @@ def test_what_no_cause_explains_is_said_to_be_unexplained(tmp_path: Path) -> Non
     assert report.causes == ()
 
 
-def test_an_inverted_mask_is_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize("share", [0.5, 0.76, 0.95])
+def test_a_log_that_was_not_drawn_is_not_judged_as_drawn(share: float, tmp_path: Path) -> None:
+    """Most steps are the action without chance to the last digit, which no draw is; the others are off."""
+    policy = policy_of("3DBall")
+    log = recorded(policy, Fault(), episodes=8, length=50)
+    rng = np.random.default_rng(0)
+    off = rng.random(400) > share
+    spread = rng.normal(0, 0.5, log["action"].shape) * off[:, None]
+    report = explained(policy, {**log, "action": (log["action"] + spread).astype(np.float32).clip(-1, 1)}, tmp_path)
+    assert not report.fits and not report.drawn
+    assert report.misfits.sum() >= 0.9 * off.sum()
+
+
+@pytest.mark.parametrize("free", [0, 3], ids=["every step forbids", "each third step allows all"])
+def test_an_inverted_mask_is_named(free: int, tmp_path: Path) -> None:
     policy = policy_of("discrete")
     log = recorded(policy, Fault(), episodes=8, length=40)
     rng = np.random.default_rng(0)
@@ -233,6 +247,9 @@ def test_an_inverted_mask_is_named(tmp_path: Path) -> None:
     for size in policy.signature.branches:  # one action of each branch is forbidden, another allowed
         masks[np.arange(len(masks)), start + rng.integers(0, size, len(masks))] = 0
         start += size
+    logged = 1 - masks
+    if free:
+        masks[::free] = logged[::free] = 1
     decided = policy.decide(log[vector_of(policy)], masks=masks, deterministic=True)
-    report = explained(policy, {**log, "action_masks": 1 - masks, "action": decided.action}, tmp_path)
+    report = explained(policy, {**log, "action_masks": logged, "action": decided.action}, tmp_path)
     assert [(c.kind, c.says) for c in report.causes] == [("mask", "the mask was inverted")]
