@@ -134,6 +134,19 @@ def test_zeros_as_tensorflow_writes_them_are_zeros() -> None:
         read_graph(graph_bytes([placeholder("x"), zeros, weights, *layers]))
 
 
+def test_a_saved_model_without_values_is_refused(tmp_path: Path) -> None:
+    (made,) = export([path("continuous")], ExportOptions(tmp_path, targets=("saved_model",), verify="none"))
+    file = made.folder / "saved_model" / "saved_model.pb"
+    saved = schema.parse(schema.SavedModel, file.read_bytes(), "SavedModel")
+    for proto in saved.meta_graphs[0].graph_def.node:
+        if proto.op == "Const" and not proto.attr["value"].tensor.string_val:
+            for field in _FIELDS:
+                proto.attr["value"].tensor.ClearField(field)
+    (tmp_path / "saved_model.pb").write_bytes(saved.SerializeToString())
+    with pytest.raises(DamagedFileError, match="hold no values"):
+        read_source(tmp_path / "saved_model.pb")
+
+
 def test_other_files_beside_a_manifest_stay_what_they_are(tmp_path: Path) -> None:
     folder = split(path("continuous"), tmp_path / "web")
     (folder / "frozen.pb").write_bytes(path("discrete").read_bytes())
