@@ -20,7 +20,7 @@ from converters.graph.run import run_graph
 from converters.graph.shapes import infer_types
 from converters.graph.types import BATCH
 from converters.policy.policy import Policy
-from exporter import export_model
+from exporter import export_model, load_policy
 from exporter.verify.checks.consumer import consumers
 from signatures.contract import EMBEDDED
 from signatures.errors import ProfileError, UsageError
@@ -244,6 +244,9 @@ def test_a_scene_of_the_first_releases_feeds_epsilon(source: str, deterministic:
     wanted = run_graph(plain.graph, {plain.feeds["state"]: state}, [plain.fetches["action"]])
     np.testing.assert_allclose(act(0), wanted[plain.fetches["action"]], 1e-5, 1e-5)
     assert np.array_equal(act(0), act(0.5)) == deterministic
+    quiet = load_policy(made.folder).decide(state, deterministic=True).continuous
+    assert quiet is not None
+    np.testing.assert_allclose(quiet, act(0), 1e-5, 1e-5)
     said = commands.export_model("snippets", made.folder, "--for", "internal-brain").out
     assert f"Graph Placeholders            Size {0 if deterministic else 1}" in said
     assert ("epsilon: Floating Point, Min Value 0, Max Value 0" in said) is not deterministic

@@ -156,6 +156,7 @@ class Dressing(Struct, dict=True):
             interface=_interface_of(self.policy.signature.interface, {s.name for s in self.inputs if s.name in feeds}),
         )
         names = [s.name for s in signature.inputs], [s.name for s in signature.outputs]
+        drawn = {s.name: s.shape for s in self.policy.signature.noise[len(signature.noise) :]}  # the first are taken
         return Policy(
             name=self.policy.name,
             graph=Graph((*work.nodes, *beside)),
@@ -163,8 +164,8 @@ class Dressing(Struct, dict=True):
             feeds={n: n for n in names[0]},
             fetches={n: n for n in names[1]},
             source=SourceMap(
-                noise={s.name: s.shape for s in self.policy.signature.noise},
-                noise_kept=bool(self.policy.signature.noise),
+                noise=drawn,
+                noise_kept=bool(drawn),
             ),
             constants=dict(self.constants),
             kept=dict(self.kept),
