@@ -57,6 +57,8 @@ class Case(Struct, frozen=True):
     name: str
     feeds: dict[str, np.ndarray]
     batch: int
+    #: What an environment may give at every step: typical observations, whatever the masks, ids and images are.
+    ordinary: bool = True
 
     def flush_denormals(self) -> dict[str, np.ndarray] | None:
         """The feeds as a processor sees them that takes denormals for zero, None where there are none."""
@@ -167,7 +169,7 @@ def _case(
             feeds[spec.name] = (masks or all_allowed)(rng, batch, branches).astype(spec.dtype)
         else:
             feeds[spec.name] = np.asarray(_other(signature, rng, spec, shape, style, pixels), dtype=spec.dtype)
-    return Case(name, feeds, batch)
+    return Case(name, feeds, batch, style in (_typical, _each_id))
 
 
 def _other(

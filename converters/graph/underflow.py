@@ -1,7 +1,7 @@
 """What rests on a number that float32, or a runtime's approximation of a function, cannot tell from zero.
 
 ``log(sigmoid(x))`` of -30 is -30, and -∞ where a runtime's sigmoid is zero (onnxruntime: from -17 on); of -1e3 it is
--∞, -97 or -87. Whatever is computed with that has no answer.
+-∞, -97 or -87. An answer lies between what comes of the two ends of such a number, and what float64 makes of it.
 """
 
 from __future__ import annotations
@@ -16,21 +16,12 @@ from converters.graph.ops.approximations import RANGES, TINY
 from converters.graph.ops.base import OpDef
 
 
-class Ends(Jitter):
-    """Runs of a graph at the two ends of what a number may be that is not told from zero.
+class End(Jitter):
+    """A run at one end of what a number may be that is not told from zero: zero, or as large as it may be."""
 
-    In the first run it is zero; ``keep`` begins one in which it is as large as it may be. With ``mark``, what is finite
-    in one of the two alone is NaN from there on.
-    """
-
-    def __init__(self, arithmetic: str) -> None:
+    def __init__(self, arithmetic: str, *, kept: bool) -> None:
         super().__init__(0, arithmetic)
-        self._finite: list[np.ndarray] = []
-        self._kept, self._marks, self._number = False, False, 0
-
-    def keep(self, *, mark: bool) -> None:
-        """Begin another run."""
-        self._kept, self._marks, self._number = True, mark, 0
+        self._kept = kept
 
     def operands(self, entry: OpDef, operands: Sequence[np.ndarray]) -> list[np.ndarray]:
         """What an op reads, as it is."""
@@ -40,7 +31,7 @@ class Ends(Jitter):
         self, entry: OpDef, node: Node, operands: Sequence[np.ndarray], results: Sequence[np.ndarray]
     ) -> Sequence[np.ndarray]:
         """What an op gives, at this run's end."""
-        return [self._mark(self._settle(entry, r)) if r.dtype == np.float32 else r for r in results]
+        return [self._settle(entry, r) if r.dtype == np.float32 else r for r in results]
 
     def _settle(self, entry: OpDef, array: np.ndarray) -> np.ndarray:
         """An op's result with what is not told from zero at this run's end.
@@ -55,12 +46,16 @@ class Ends(Jitter):
             lost &= array != 0
         return np.where(lost, np.copysign(end if self._kept else np.float32(0), array), array) if lost.any() else array
 
-    def _mark(self, array: np.ndarray) -> np.ndarray:
-        finite = np.isfinite(array)
-        if not self._kept:
-            self._finite.append(finite)
-            return array
-        before, self._number = self._finite[self._number], self._number + 1
-        if not self._marks or before.shape != finite.shape:
-            return array
-        return np.where(before == finite, array, np.float32(np.nan))
+
+class Whole(Jitter):
+    """A run in float64, which is moved by nothing."""
+
+    def operands(self, entry: OpDef, operands: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """What an op reads, with more digits than it has."""
+        return [a.astype(np.float64) if a.dtype == np.float32 else a for a in operands]
+
+    def results(
+        self, entry: OpDef, node: Node, operands: Sequence[np.ndarray], results: Sequence[np.ndarray]
+    ) -> Sequence[np.ndarray]:
+        """What an op gives, as it is."""
+        return results

@@ -124,6 +124,8 @@ def _outcome(case: ET.Element, comparisons: Sequence[Finding]) -> None:
         kind = "error" if all(isinstance(c, Failure) for c in failed) else "failure"
         element = ET.SubElement(case, kind, type=f"export-model.{failed[0].kind}", message=_text(lines[0]))
         element.text = _text("\n".join(lines))
+    if forgiven := [f"{c.kind}: {c.forgiven_text}" for c in comparisons if c.forgiven]:
+        ET.SubElement(case, "system-out").text = _text("forgiven beyond the tolerance\n" + "\n".join(forgiven))
 
 
 def _not_run(entry: Entry) -> dict[str, dict[str, str]]:

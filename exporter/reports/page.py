@@ -34,6 +34,7 @@ _SECTIONS: tuple[Callable[[Entry], Markup | None], ...] = (
     sections.failures,
     sections.returns,
     sections.agreement,
+    sections.excuses,
     sections.spread,
     sections.memory,
     sections.policy_graph,

@@ -126,6 +126,22 @@ def agreement(entry: Entry) -> Markup:
     return section("Agreement", table(caption, head, rows, range(3, len(head))))
 
 
+def excuses(entry: Entry) -> Markup | None:
+    """Which rules forgave a difference beyond the tolerance, of which elements."""
+    rows = [
+        (_breakable(c.format), c.runtime, c.output, f.excuse.title, f"{f.elements:,} of {c.elements:,}", _most(f.most))
+        for c in entry.report.comparisons
+        for f in c.forgiven
+    ]
+    head = ("format", "runtime", "output", "rule", "elements", "largest difference")
+    caption = "Elements beyond the tolerance that a rule forgave: docs/agreement.md says what each may hide"
+    return section("Forgiven", table(caption, head, rows, (4, 5))) if rows else None
+
+
+def _most(difference: float) -> str:
+    return f"{difference:.2g}" if math.isfinite(difference) else ""
+
+
 def _breakable(name: str) -> Child:
     head, colon, rest = name.partition(":")
     return [head, colon, el("wbr"), rest] if colon else name

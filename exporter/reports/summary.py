@@ -28,7 +28,8 @@ def comparison_table(report: ParityReport) -> str:
     parts = []
     for pair in report.pairs:
         rows = [[_word(c.passed), _output(c), c.kind, *c.columns(), c.worst_input or ""] for c in pair.findings]
-        parts.append(f"{pair.format} in {pair.runtime}\n{table(head, rows)}")
+        told = [f"{c.output} [{c.kind}]: {c.forgiven_text}" for c in pair.findings if c.forgiven]
+        parts.append("\n".join([f"{pair.format} in {pair.runtime}", table(head, rows), *_forgiven_lines(told)]))
     return "\n\n".join(parts)
 
 
@@ -40,6 +41,10 @@ def foreign_words(report: ParityReport) -> list[str]:
             lines += [f"{found.where} said, in words of its own:"]
             lines += [f"  | {printable(line)}" for line in found.said.splitlines()]
     return lines
+
+
+def _forgiven_lines(told: Sequence[str]) -> list[str]:
+    return ["forgiven beyond the tolerance (docs/agreement.md):", *(f"  {line}" for line in told)] if told else []
 
 
 def _word(passed: bool) -> str:

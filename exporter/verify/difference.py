@@ -9,12 +9,15 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
+from exporter.verify.excuses import BOTH_NAN, CHAOS, ROUNDING, Excuse, Forgiven
 from exporter.verify.tolerances import Tolerance
 
 #: Integer dtypes that TensorFlow.js has not: int32 in place of int64 there is listed, not a failure.
 NARROWED = {("int64", "int32")}
 #: What an output may be off of how far it varies.
 SHARE = 1e-3
+#: Rounding that explains so much of how far an output varies says nothing of an answer.
+OPEN = 0.1
 #: What a number may be off of its own size, however little its column varies: 64 units in the last place of float32
 #: (measured on TensorFlow.js' wasm: 4e-6 of 1e4).
 SIZE = 2.0**-17
@@ -45,6 +48,11 @@ class Difference(Struct, frozen=True):
     worst: int | None = None
     #: The largest |a − b| as a share of what was allowed there, rounding included: it passes up to 1.
     share: float = 0.0
+    #: How many elements there are, and which of them what rule forgave (exporter/verify/excuses.py).
+    elements: int = 0
+    forgiven: tuple[Forgiven, ...] = ()
+    #: How many are beyond the tolerance, whether a rule forgives them or not.
+    beyond: int = 0
 
 
 def compare(
@@ -52,67 +60,89 @@ def compare(
     candidate: np.ndarray,
     tolerance: Tolerance,
     *,
-    free: np.ndarray | None = None,
+    free: Sequence[tuple[Excuse, np.ndarray]] = (),
     narrowed: bool = False,
     rounding: np.ndarray | None = None,
     most: np.ndarray | None = None,
+    ceiling: np.ndarray | float = np.inf,
 ) -> Difference:
     """Compare by |a − b| ≤ atol + rtol·|b|, element by element.
 
-    ``free`` marks elements where another answer is right too (a tie, a reference without one). ``narrowed`` allows
-    int32 for int64. ``most`` are bounds per column that go before larger ones.
-    ``rounding`` is an absolute difference per element that float32 itself explains; where it is larger than the
-    tolerance it takes its place, and where it is infinite there is no answer. A NaN or infinity must stand at the same
-    place on both sides.
+    ``free`` marks elements where the answer is as right, by the rule that says so. ``narrowed`` allows int32 for int64.
+    ``most`` are bounds per column that go before larger ones. ``rounding`` is an absolute difference per element that
+    float32 itself explains; where it is larger than the tolerance it takes its place, up to ``ceiling``. A NaN or
+    infinity must stand at the same place on both sides; a NaN beside a finite number is right by one rule alone.
     """
-    if reference.shape != candidate.shape:
-        return wrong(f"shape {list(candidate.shape)} instead of {list(reference.shape)}")
-    names = (reference.dtype.name, candidate.dtype.name)
-    if names[0] != names[1] and not (narrowed and names in NARROWED):
-        return wrong(f"dtype {names[1]} instead of {names[0]}")
+    if (other := _other_kind(reference, candidate, narrowed=narrowed)) is not None:
+        return other
     if not reference.size:
         return Difference(0.0, 0.0, True)
     a, b = candidate.astype(np.float64), reference.astype(np.float64)
-    if rounding is not None and np.isinf(rounding).any():
-        free = np.isinf(rounding) | (False if free is None else free)
-    odd = ~np.isfinite(a) | ~np.isfinite(b)
-    if odd.any():
-        same = (np.isnan(a) & np.isnan(b)) | (a == b) | (False if free is None else free)
-        if not same[odd].all():
-            return replace(wrong(ONE_SIDED), worst=int((odd & ~same).argmax()))
-        a, b = np.where(odd, 0.0, a), np.where(odd, 0.0, b)
-    difference = np.abs(a - b)
-    if free is not None:
-        difference = np.where(free, 0.0, difference)
+    masks = [(e, mask if e.of_nan else mask & ~(np.isnan(a) & np.isfinite(b))) for e, mask in free]
+    freed = np.logical_or.reduce([mask for _, mask in masks]) if masks else np.zeros(a.shape, bool)
+    odd, nan = ~np.isfinite(a) | ~np.isfinite(b), np.isnan(a) & np.isnan(b)
+    one_sided = odd & ~(nan | (a == b))
+    if (one_sided & ~freed).any():
+        wrong_there = one_sided & ~freed
+        return replace(wrong(ONE_SIDED), worst=int(wrong_there.argmax()), elements=a.size, beyond=int(one_sided.sum()))
+    a, b = np.where(odd, 0.0, a), np.where(odd, 0.0, b)
+    whole = np.abs(a - b)
+    difference = np.where(freed, 0.0, whole)
     with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
         # Beside a reference of nearly zero the tolerance is what a difference is relative to.
         relative = difference / np.maximum(np.abs(b), tolerance.atol)
     bound = tolerance.atol + tolerance.rtol * np.abs(b) if reference.dtype.kind == "f" else np.zeros_like(b)
     if most is not None:
         bound = np.minimum(bound, np.maximum(most, SIZE * np.abs(b)))
+    beyond = (whole > bound) | one_sided
     if rounding is not None:
+        rounding = np.minimum(rounding, ceiling)
+        explained = beyond & ~freed & (difference <= rounding)
+        reached = explained & (rounding >= OPEN * np.asarray(ceiling))
+        masks = [*masks, (ROUNDING, explained & ~reached), (CHAOS, reached)]
         bound = np.maximum(bound, rounding)
-    passed = bool((difference <= bound).all())
     worst_relative = float(np.where(difference > 0, relative, 0.0).max())
-    explained = 0.0 if rounding is None else float(rounding.reshape(-1)[int(difference.argmax())])
     needed = difference / (1 + np.abs(b))
     if rounding is not None:
         needed = np.where(difference <= rounding, 0.0, needed)
     worst = int(needed.argmax())
     # A little more than the quotient: it was rounded, and a user who gives it must pass.
     smallest = float(needed.reshape(-1)[worst]) * (1 + 1e-12) if reference.dtype.kind == "f" else None
-    histogram, share = decades(difference), float(shares(difference, bound).max())
+    whole = np.where(one_sided, np.inf, whole)
     return Difference(
         max_abs=float(difference.max()),
         max_rel=worst_relative,
-        passed=passed,
-        reason="",
-        rounding=explained,
-        histogram=histogram,
+        passed=bool((difference <= bound).all()),
+        rounding=0.0 if rounding is None else float(rounding.reshape(-1)[int(difference.argmax())]),
+        histogram=decades(difference),
         smallest_tolerance=smallest,
         worst=worst,
-        share=share,
+        share=float(shares(difference, bound).max()),
+        elements=a.size,
+        forgiven=_count_forgiven([*masks, (BOTH_NAN, nan)], beyond | nan, whole),
+        beyond=int(beyond.sum()),
     )
+
+
+def _other_kind(reference: np.ndarray, candidate: np.ndarray, *, narrowed: bool) -> Difference | None:
+    if reference.shape != candidate.shape:
+        return wrong(f"shape {list(candidate.shape)} instead of {list(reference.shape)}")
+    names = (reference.dtype.name, candidate.dtype.name)
+    if names[0] != names[1] and not (narrowed and names in NARROWED):
+        return wrong(f"dtype {names[1]} instead of {names[0]}")
+    return None
+
+
+def _count_forgiven(
+    masks: Sequence[tuple[Excuse, np.ndarray]], beyond: np.ndarray, whole: np.ndarray
+) -> tuple[Forgiven, ...]:
+    """What each rule forgave of what is ``beyond`` the tolerance: what one before it did is not counted again."""
+    made, left = [], beyond
+    for excuse, mask in masks:
+        if (there := mask & left).any():
+            made.append(Forgiven(excuse, int(there.sum()), float(whole[there].max())))
+            left = left & ~there
+    return tuple(made)
 
 
 def shares(difference: np.ndarray, bound: np.ndarray) -> np.ndarray:
@@ -168,6 +198,7 @@ def compare_all(
             histogram=tuple(counts[i]),
             smallest_tolerance=float(needed[i]) if wanted.kind == "f" else None,
             share=float(share[i]),
+            elements=sizes[i],
         )
         if passed[i]
         else None
@@ -188,7 +219,7 @@ def steps(exact: np.ndarray, moved: np.ndarray) -> np.ndarray:
 
 
 def spread(answers: Sequence[np.ndarray]) -> np.ndarray | None:
-    """``SHARE`` of how far each column varies over float ``answers`` of one shape but for the rows: [1, ...].
+    """How far each column varies over float ``answers`` of one shape but for the rows: [1, ...].
 
     Infinite where it does not vary at all; None where nothing can be told.
     """
@@ -200,7 +231,7 @@ def spread(answers: Sequence[np.ndarray]) -> np.ndarray | None:
         return None
     rows = np.concatenate(answers).astype(np.float64)
     with np.errstate(invalid="ignore"):
-        varies = SHARE * (rows.max(axis=0, keepdims=True) - rows.min(axis=0, keepdims=True))
+        varies = rows.max(axis=0, keepdims=True) - rows.min(axis=0, keepdims=True)
     return np.where(np.isfinite(varies) & (varies > 0), varies, np.inf)
 
 
@@ -220,34 +251,43 @@ def floor_log_probs(log_probs: np.ndarray, branches: Sequence[int]) -> np.ndarra
     return np.concatenate(parts, axis=-1)
 
 
-def near_best(
-    scores: np.ndarray, branches: Sequence[int], tolerance: Tolerance, rounding: np.ndarray | None = None
-) -> np.ndarray:
-    """[B, ΣB]: which classes may be the best of their branch, as the best score or their own is within its bound.
+def near_best(low: np.ndarray, high: np.ndarray, branches: Sequence[int]) -> np.ndarray:
+    """[B, ΣB]: which classes may be the best of their branch, of scores between ``low`` and ``high``.
 
-    Each of the two may be off by the tolerance, or by what ``rounding`` explains of it. NaN decides nothing.
+    Those that reach what the best of the others has at least. NaN decides nothing.
     """
-    columns = []
-    start = 0
-    for size in branches:
-        part = scores[:, start : start + size].astype(np.float64)
-        moved = np.zeros(part.shape) if rounding is None else rounding[:, start : start + size]
-        start += size
-        place = part.argmax(axis=1)[:, None]
-        best = np.take_along_axis(part, place, axis=1)
-        off = np.maximum(tolerance.atol + tolerance.rtol * np.abs(best), moved)
-        with np.errstate(invalid="ignore"):
-            far = best - part > off + np.take_along_axis(off, place, axis=1)
-        columns.append(~far | (part == best))
-    return np.concatenate(columns, axis=1)
+    edges = np.cumsum(branches)[:-1]
+    pairs = zip(*(np.split(a.astype(np.float64), edges, axis=1) for a in (low, high)), strict=True)
+    with np.errstate(invalid="ignore"):
+        return np.concatenate([~(up < np.fmax.reduce(down, axis=1, keepdims=True)) for down, up in pairs], axis=1)
+
+
+def score_bounds(
+    scores: np.ndarray, branches: Sequence[int], tolerance: Tolerance, rounding: np.ndarray | float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Between what each score may lie: off by the tolerance of the best of its branch, or what rounding explains."""
+    whole = scores.astype(np.float64)
+    sizes = np.asarray(branches)
+    best = np.repeat(np.maximum.reduceat(whole, np.cumsum(sizes) - sizes, axis=1), sizes, axis=1)
+    off = np.maximum(tolerance.atol + tolerance.rtol * np.abs(best), rounding)
+    off = np.where(np.isfinite(off), off, 0.0)
+    return whole - off, whole + off
 
 
 def ties(
-    scores: np.ndarray, branches: Sequence[int], tolerance: Tolerance, rounding: np.ndarray | None = None
+    scores: np.ndarray, branches: Sequence[int], tolerance: Tolerance, rounding: np.ndarray | float = 0.0
 ) -> np.ndarray:
     """[B, branches]: where several classes of a branch may be the best."""
-    near = near_best(scores, branches, tolerance, rounding)
+    near = near_best(*score_bounds(scores, branches, tolerance, rounding), branches)
     return np.stack([part.sum(axis=1) > 1 for part in np.split(near, np.cumsum(branches)[:-1], axis=1)], axis=1)
+
+
+def is_marked(marked: np.ndarray, classes: np.ndarray, branches: Sequence[int]) -> np.ndarray:
+    """[B, branches]: whether the class of each branch is one of those ``marked`` [B, ΣB]; none outside of it is."""
+    sizes = np.asarray(branches)
+    inside = (classes >= 0) & (classes < sizes)
+    places = np.cumsum(sizes) - sizes + np.where(inside, classes, 0)
+    return np.asarray(inside & np.take_along_axis(marked, places.astype(np.int64), axis=1))
 
 
 def decades(differences: np.ndarray) -> tuple[int, ...]:

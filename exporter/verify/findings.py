@@ -10,6 +10,7 @@ from msgspec.structs import replace
 
 from converters.files.children.process import RunFailedError
 from exporter.verify.difference import by_decade
+from exporter.verify.excuses import Forgiven, forgiven_text
 from exporter.verify.statistics import FALSE_ALARM
 from exporter.verify.tolerances import Tolerance
 from signatures.fields import Record, explicit_default
@@ -99,6 +100,9 @@ class Finding(Struct, frozen=True):
     against: str = ""
     #: The largest difference as a share of what was allowed there, rounding included; it passes up to 1.
     share: float = 0.0
+    #: How many elements of all inputs were compared, and how many of them which rule forgave.
+    elements: int = 0
+    forgiven: tuple[Forgiven, ...] = ()
 
     def __repr__(self) -> str:
         return f"<{self.where}: {self.output} {self.cell()}, {'ok' if self.passed else 'FAIL'} [{self.kind}]>"
@@ -112,6 +116,11 @@ class Finding(Struct, frozen=True):
     def where(self) -> str:
         """The format and the runtime."""
         return f"{self.format} in {self.runtime}"
+
+    @property
+    def forgiven_text(self) -> str:
+        """What was forgiven, by which rule; empty where nothing was."""
+        return forgiven_text(self.forgiven, self.elements)
 
     @property
     def bound_text(self) -> str:
@@ -171,6 +180,7 @@ class Finding(Struct, frozen=True):
             "smallest_tolerance": None if self.passed else self.smallest_tolerance,
             "bisection": None if self.bisection is None else self.bisection.to_dict(),
             "against": self.against,
+            "forgiven": [{**f.to_dict(), "of": self.elements} for f in self.forgiven],
         }
         return {
             "format": self.format,

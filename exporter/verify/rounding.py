@@ -4,7 +4,7 @@ A difference is rounding if it is at most ``FACTOR`` times what moving every int
 the runtime's approximation of a function, may move it makes (converters/graph/jitter.py), the largest of ``RUNS``, or,
 to make sure, of ``MORE_RUNS`` more. It matters for inputs of 1e3, for long sums, where a formula cancels, and where a
 memory carries it from step to step; elsewhere the default tolerance is larger. What rests on a number that is not told
-from zero has no answer (converters/graph/underflow.py).
+from zero lies between two ends (converters/graph/underflow.py).
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
+from msgspec import Struct
 
 from converters.files.children.process import LoadedModel, RunFailedError
 from converters.graph.jitter import Jitter
@@ -20,6 +21,7 @@ from converters.graph.run import run_graph
 from converters.runtimes.registry import RUNTIMES
 from exporter.verify.difference import steps
 from exporter.verify.participants import Feeds
+from exporter.verify.tolerances import Tolerance
 from signatures.sampling import Case
 
 FACTOR = 4
@@ -60,16 +62,19 @@ class Rounding:
                 self._known[key] = self._largest_of([exact], [[m] for m in moved])
         return self._known[key][0] if self._known[key] else {}
 
-    def open_elements(self, model: LoadedModel, case: Case, runtime: str) -> Mapping[str, np.ndarray]:
-        """Of one input, infinite where an element rests on a number that is not told from zero, else 0."""
-        key = (case.name, f"undetermined by {_ARITHMETIC.get(runtime, 'processor')}", False)
+    def ends(self, model: LoadedModel, case: Case, runtime: str) -> Sequence[Arrays]:
+        """What comes of one input with numbers that are not told from zero as zero, kept, and in float64."""
+        key = (case.name, f"the ends of {_ARITHMETIC.get(runtime, 'processor')}", False)
         if key not in self._known:
-            request = {"undetermined": True, "arithmetic": _ARITHMETIC.get(runtime, "processor")}
+            arithmetic = _ARITHMETIC.get(runtime, "processor")
+            requests = [{"end": end, "arithmetic": arithmetic} for end in ("zero", "kept", "float64")]
             try:
-                self._known[key] = model.run_all([case.feeds], self._names, [request])
+                answers = model.run_all([case.feeds] * len(requests), self._names, requests)
             except RunFailedError:
                 self._known[key] = []
-        return self._known[key][0] if self._known[key] else {}
+            else:
+                self._known[key] = [self._settled(answer) for answer in answers]
+        return self._known[key]
 
     def steps(
         self, model: LoadedModel, rolled: Rolled, memory: Sequence[str], number: int, runtime: str, *, sure: bool
@@ -120,3 +125,38 @@ def _largest(exact: np.ndarray, moved: Sequence[np.ndarray]) -> np.ndarray:
     for each in moved:
         floor = np.maximum(floor, steps(exact, each))
     return FACTOR * floor
+
+
+class Hull(Struct, frozen=True):
+    """Between what an answer lies where numbers rest on what is not told from zero.
+
+    That is what both ends, float64 and the reference make of them, and as far again beyond, as what is computed from
+    several of them has no order. ``open`` and ``nan`` say where the ends are apart, and where one of them is NaN.
+    """
+
+    open: np.ndarray
+    nan: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+    def holds(self, answer: np.ndarray) -> np.ndarray:
+        """Where an answer is one of those."""
+        with np.errstate(invalid="ignore"):
+            return np.asarray(self.open & (answer >= self.low) & (answer <= self.high))
+
+
+def hull(ends: Sequence[np.ndarray], reference: np.ndarray, rounding: np.ndarray | float) -> Hull:
+    """Return what ``ends`` say of an output: of numbers as zero, kept, and in float64."""
+    zero, kept, _ = (e.astype(np.float64) for e in ends)
+    default = Tolerance()
+    with np.errstate(invalid="ignore"):
+        apart = ~(np.abs(zero - kept) <= default.atol + default.rtol * np.abs(kept)) & (zero != kept)
+        every = np.stack([*ends, reference.astype(np.float64)])
+        low, high = np.fmin.reduce(every), np.fmax.reduce(every)
+        width = high - low
+        beyond = np.where(np.isfinite(width), width, 0.0) + rounding
+    nan = np.isnan(zero), np.isnan(kept)
+    apart &= ~(nan[0] & nan[1])
+    nothing = np.isnan(low)
+    low, high = np.where(nothing, -np.inf, low - beyond), np.where(nothing, np.inf, high + beyond)
+    return Hull(apart, apart & (nan[0] | nan[1]), low, high)

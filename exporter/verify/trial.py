@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 from msgspec import Struct
+from msgspec.structs import replace
 
 from converters.formats.bundle.embed import runnable
 from converters.formats.registry import narrows
@@ -16,20 +17,44 @@ from converters.graph.run import run_graph
 from converters.runtimes.pool import RuntimePool
 from exporter.verify.bisection import Bisector
 from exporter.verify.choices import Choices, broken_ties
-from exporter.verify.difference import ONE_SIDED, SHARE, Difference, compare, compare_all, floor_log_probs, spread, ties
+from exporter.verify.difference import (
+    ONE_SIDED,
+    OPEN,
+    SHARE,
+    Difference,
+    compare,
+    compare_all,
+    floor_log_probs,
+    is_marked,
+    near_best,
+    score_bounds,
+    spread,
+)
 from exporter.verify.drawn_columns import without_draws
+from exporter.verify.excuses import (
+    CHAOS,
+    NAN_FROM_ZERO,
+    NEVER,
+    NO_DEVIATION,
+    NOT_FROM_ZERO,
+    TIE,
+    ZERO_INPUTS,
+    Excuse,
+    Forgiven,
+)
 from exporter.verify.findings import Bisection, Finding, Shape
 from exporter.verify.golden import Golden, read_golden
 from exporter.verify.options import VerifyOptions
 from exporter.verify.participants import Feeds, Participant, PolicyUnderTest
 from exporter.verify.reference import Reference
-from exporter.verify.rounding import Rounding
+from exporter.verify.rounding import Hull, Rounding, hull
 from exporter.verify.tolerances import Tolerance, tolerance_by_rules, tolerance_for
 from exporter.verify.work import Allowance, products
 from signatures.roles import Role
 from signatures.sampling import FAR_CASES, Case, draw_cases, draw_rollout, unknown_ids
 
 Arrays = dict[str, np.ndarray]
+Hulls = Mapping[str, Hull]
 #: Give up above this multiple of the rounding bound.
 _GIVE_UP_FACTOR = 8
 #: Outputs that an argmax is taken of.
@@ -41,6 +66,17 @@ class Inputs(Struct, frozen=True):
 
     cases: Sequence[Case]
     steps: Sequence[Feeds] = ()
+
+
+class Question(Struct, frozen=True):
+    """What rules that forgive are asked of: an answer, the input or step, and how far it is off as it is."""
+
+    name: str
+    expected: Feeds
+    got: np.ndarray
+    participant: Participant
+    at: Case | int
+    found: Difference
 
 
 class Trial:
@@ -58,8 +94,6 @@ class Trial:
             self.steps += draw_rollout(self.signature, seed=options.seed, steps=options.steps)
         #: cases that tell how far an output varies
         self._typical = [case for case in drawn if case.name.startswith("typical")]
-        #: the others of those that were drawn: nobody is known to feed them, and float32 need not have an answer
-        self._edges = {id(case) for case in drawn} - {id(case) for case in self._typical}
         self._scores = {s.name for s in self.signature.outputs if s.role is Role.LOG_PROBS}
         self.choices = Choices(tested.graph)
         self._cost = 0
@@ -74,7 +108,6 @@ class Trial:
     def replace_inputs(self, inputs: Inputs) -> None:
         """Ask these in place of what was drawn."""
         self.cases, self.steps, self._typical = list(inputs.cases), list(inputs.steps), list(inputs.cases)
-        self._edges = set()
 
     def ask(self, reference: Reference) -> None:
         """Have every input answered by the reference. Raises RunFailedError."""
@@ -132,53 +165,73 @@ class Trial:
     ) -> Difference:
         """The difference of ``got`` from the reference's answer.
 
-        What rounding explains is looked at where it matters, for an input or a step of the rollout.
+        What may forgive it is asked where it matters, for an input or a step of the rollout, one after the other.
         """
         found = self._compare(name, expected, got, participant)
-        if at is None or found.passed:
+        if at is None or found.passed or found.reason not in ("", ONE_SIDED):
             return found
-        explained = found if found.reason else self._with_rounding(name, expected, got, participant, at)
-        if explained.passed or found.reason not in ("", ONE_SIDED) or id(at) not in self._edges:
-            return explained
-        assert isinstance(at, Case)
-        undetermined = self.rounding.open_elements(self.reference.model, at, participant.runtime)
-        if not any(a.any() for a in undetermined.values()):
-            return explained
-        rounding = self._rounding_bounds(at, participant, sure=True)
-        bounds = {n: np.maximum(a, rounding.get(n, 0)) for n, a in undetermined.items()}
-        return self._compare(name, expected, got, participant, bounds)
+        asked = Question(name, expected, got, participant, at, found)
+        # Beside infinity no rounding is any.
+        forgiving = (self._zero_inputs, self._rounding, self._choices, self._far_rounding) if not found.reason else ()
+        for forgive in (*forgiving, self._ends):
+            found = forgive(asked) or found
+            if found.passed:
+                break
+        return found
 
-    def _with_rounding(
-        self, name: str, expected: Feeds, got: np.ndarray, participant: Participant, at: Case | int
-    ) -> Difference:
-        """A difference that is larger than the tolerance, with what rounding explains of it."""
-        if isinstance(at, Case) and (flushed := at.flush_denormals()) is not None:
-            if at.name not in self._flushed:
-                (self._flushed[at.name],) = self.reference.answers([flushed])
-            if (other := self._compare(name, self._flushed[at.name], got, participant)).passed:
-                return other
-        rounding = self._rounding_bounds(at, participant)
-        explained = self._compare(name, expected, got, participant, rounding)
-        if not explained.passed and (settled := self._broken_ties(name, expected, got, participant, at)) is not None:
-            expected = {**expected, name: settled}
-            explained = self._compare(name, expected, got, participant, rounding)
-        far = {n: _GIVE_UP_FACTOR * a for n, a in rounding.items()}
-        if explained.passed or not self._compare(name, expected, got, participant, far).passed:
-            return explained
-        return self._compare(name, expected, got, participant, self._rounding_bounds(at, participant, sure=True))
-
-    def _broken_ties(
-        self, name: str, expected: Feeds, got: np.ndarray, participant: Participant, at: Case | int
-    ) -> np.ndarray | None:
-        """The reference's answer with choices among scores that are as good made as ``got`` makes them."""
-        tolerance = self.tolerance(name, participant)
-        if expected[name].shape != got.shape or not self.choices.behind(name):
+    def _zero_inputs(self, asked: Question) -> Difference | None:
+        """Held against the reference's answers to the same inputs with zeros for denormals; None where it differs."""
+        if not isinstance(asked.at, Case) or (flushed := asked.at.flush_denormals()) is None:
             return None
-        feeds = at.feeds if isinstance(at, Case) else self._fed_at(at)
-        graph = runnable(self.tested.graph)
-        moved = partial(self.rounding.inner, participant.runtime, graph)
-        scores = tolerance if tolerance.atol > Tolerance().atol else Tolerance()
-        return broken_ties(expected[name], self.choices.others(name, feeds, scores, moved), got, tolerance)
+        if asked.at.name not in self._flushed:
+            (self._flushed[asked.at.name],) = self.reference.answers([flushed])
+        other = self._compare(asked.name, self._flushed[asked.at.name], asked.got, asked.participant)
+        forgiven = (Forgiven(ZERO_INPUTS, asked.found.beyond, asked.found.max_abs), *other.forgiven)
+        return replace(other, forgiven=forgiven) if other.passed else None
+
+    def _rounding(self, asked: Question, *, sure: bool = False) -> Difference:
+        bounds = self._rounding_bounds(asked.at, asked.participant, sure=sure)
+        return self._compare(asked.name, asked.expected, asked.got, asked.participant, bounds)
+
+    def _far_rounding(self, asked: Question) -> Difference | None:
+        """With rounding measured more often; None where what was measured is not near."""
+        bounds = self._rounding_bounds(asked.at, asked.participant)
+        far = {n: _GIVE_UP_FACTOR * a for n, a in bounds.items()}
+        near = self._compare(asked.name, asked.expected, asked.got, asked.participant, far).passed
+        return self._rounding(asked, sure=True) if near else None
+
+    def _choices(self, asked: Question) -> Difference | None:
+        """Held against the reference's answer with choices among scores that are as good made as the answer has them.
+
+        None where there are none.
+        """
+        name, expected, participant = asked.name, asked.expected, asked.participant
+        if expected[name].shape != asked.got.shape or not self.choices.behind(name):
+            return None
+        feeds = asked.at.feeds if isinstance(asked.at, Case) else self._fed_at(asked.at)
+        moved = partial(self.rounding.inner, participant.runtime, runnable(self.tested.graph))
+        others = self.choices.others(name, feeds, self._choice_tolerance(name, participant), moved)
+        made = broken_ties(expected[name], others, asked.got, self.tolerance(name, participant))
+        if made is None:
+            return None
+        bounds = self._rounding_bounds(asked.at, participant)
+        other = self._compare(name, {**expected, name: made}, asked.got, participant, bounds)
+        turned = made != expected[name]
+        most = float(np.abs(made - expected[name])[turned].max()) if made.dtype.kind == "f" else np.inf
+        return replace(other, forgiven=(Forgiven(TIE, int(turned.sum()), most), *other.forgiven))
+
+    def _ends(self, asked: Question) -> Difference | None:
+        """Held against what comes of numbers that are not told from zero; None at ordinary inputs."""
+        if not isinstance(asked.at, Case) or asked.at.ordinary:
+            return None
+        ends = self.rounding.ends(self.reference.model, asked.at, asked.participant.runtime)
+        bounds = self._rounding_bounds(asked.at, asked.participant, sure=True)
+        expected = self._comparable(asked.expected)
+        names = [n for n in (ends[0] if ends else ()) if n in expected and expected[n].shape == ends[0][n].shape]
+        hulls = {n: hull([end[n] for end in ends], expected[n], bounds.get(n, 0.0)) for n in names}
+        if not any(each.open.any() for each in hulls.values()):
+            return None
+        return self._compare(asked.name, asked.expected, asked.got, asked.participant, bounds, hulls)
 
     def _fed_at(self, step: int) -> Feeds:
         """What the reference was fed at a step of the rollout."""
@@ -195,17 +248,25 @@ class Trial:
         at: Sequence[Case] | Sequence[int],
     ) -> list[Difference]:
         """``difference`` of several inputs or steps. What passes as it is, nearly all, is compared at once."""
-        found = compare_all(
-            [self._comparable({name: e[name]})[name] for e in expected],
-            [self._comparable({name: g})[name] for g in got],
+        wanted = [self._comparable({name: e[name]})[name] for e in expected]
+        made = [self._comparable({name: a})[name] for a in got]
+        known = compare_all(
+            wanted,
+            made,
             self.tolerance(name, participant),
             narrowed=narrows(participant.format),
             most=self._most(name, participant),
         )
-        return [
-            self.difference(name, expected[i], got[i], participant, at[i]) if known is None else known
-            for i, known in enumerate(found)
+        found = [
+            self.difference(name, expected[i], got[i], participant, at[i]) if each is None else each
+            for i, each in enumerate(known)
         ]
+        if name not in self._scores:
+            return found
+        for i, each in enumerate(found):
+            if each.passed and (never := int(((expected[i][name] != got[i]) & (wanted[i] == made[i])).sum())):
+                found[i] = replace(each, forgiven=(*each.forgiven, Forgiven(NEVER, never, np.inf)))
+        return found
 
     def _rounding_bounds(self, at: Case | int, participant: Participant, *, sure: bool = False) -> Feeds:
         """Per output, what rounding explains of it."""
@@ -215,25 +276,48 @@ class Trial:
         return self.rounding.steps(self.reference.model, self.roll_out, kept, at, runtime, sure=sure)
 
     def _compare(
-        self, name: str, expected: Feeds, got: np.ndarray, participant: Participant, rounding: Feeds | None = None
+        self,
+        name: str,
+        expected: Feeds,
+        got: np.ndarray,
+        participant: Participant,
+        rounding: Feeds | None = None,
+        hulls: Hulls | None = None,
     ) -> Difference:
+        reference, candidate = self._comparable({name: expected[name]})[name], self._comparable({name: got})[name]
+        free = self._open_choices(name, expected, got, participant, rounding or {}, hulls or {})
+        if hulls and name in hulls and got.dtype.kind == "f" and got.shape == reference.shape:
+            nan = hulls[name].nan & ~(np.isfinite(candidate) & np.isfinite(reference))
+            free = [*free, (NOT_FROM_ZERO, hulls[name].holds(candidate)), (NAN_FROM_ZERO, nan)]
         return compare(
-            self._comparable({name: expected[name]})[name],
-            self._comparable({name: got})[name],
+            reference,
+            candidate,
             self.tolerance(name, participant),
-            free=self._open_choices(name, expected, participant, rounding or {}),
+            free=free,
             narrowed=narrows(participant.format),
             rounding=None if rounding is None or got.dtype.kind != "f" else rounding.get(name),
             most=self._most(name, participant),
+            ceiling=self._ceiling(name, reference),
         )
+
+    def _ceiling(self, name: str, reference: np.ndarray) -> np.ndarray | float:
+        """What rounding may explain at most: how far the output varies; of far numbers, a thousandth of each."""
+        found = self._spread(name)
+        if reference.dtype.kind != "f" or found is None or not np.isfinite(found).any():
+            return np.inf
+        sizes = np.abs(np.nan_to_num(reference, posinf=0, neginf=0))
+        return np.asarray(np.maximum(found[np.isfinite(found)].max(), SHARE * sizes))
 
     def _most(self, name: str, participant: Participant) -> np.ndarray | None:
         """What an output that hardly varies may be off, column by column: a share of how far it varies.
 
         A tolerance that a user or the table gave stays as it is, and so does that of a column that is always the same.
         """
-        if self.tolerance(name, participant) != Tolerance():
-            return None
+        found = self._spread(name) if self.tolerance(name, participant) == Tolerance() else None
+        return None if found is None else SHARE * found
+
+    def _spread(self, name: str) -> np.ndarray | None:
+        """How far each column of an output varies over typical inputs."""
         if name not in self._spreads:
             typical = {id(case) for case in self._typical}
             made = [
@@ -281,6 +365,8 @@ class Trial:
             bisection=bisection,
             against="numpy" if output in self._apart and kind is not Shape else "",
             share=difference.share,
+            elements=difference.elements,
+            forgiven=difference.forgiven,
         )
 
     def _judged_by(self, output: str, participant: Participant, difference: Difference) -> Tolerance:
@@ -328,23 +414,45 @@ class Trial:
             for n, a in values.items()
         }
 
-    def _open_choices(self, name: str, expected: Feeds, participant: Participant, rounding: Feeds) -> np.ndarray | None:
-        """Where an argmax is not decided, because the scores of the reference are too close.
+    def _open_choices(
+        self,
+        name: str,
+        expected: Feeds,
+        got: np.ndarray,
+        participant: Participant,
+        rounding: Feeds,
+        hulls: Hulls,
+    ) -> list[tuple[Excuse, np.ndarray]]:
+        """Where the class that was chosen may be the best one as well, because the reference's scores are too close.
 
         So, too, where no noise times a deviation that overflows is NaN in a source that is fed zeros: the policy gives
         its mean there.
         """
-        spec = self.signature.output(name)
-        if spec.role is not Role.DETERMINISTIC:
-            return None
-        if expected[name].dtype.kind == "f" and self.signature.noise:
-            return np.isnan(expected[name])
-        if not self.signature.branches or expected[name].dtype.kind == "f":
-            return None
+        spec, branches = self.signature.output(name), self.signature.branches
+        if spec.role is not Role.DETERMINISTIC or got.shape != expected[name].shape:
+            return []
+        if expected[name].dtype.kind == "f":
+            return [(NO_DEVIATION, np.isnan(expected[name]))] if self.signature.noise else []
         scores = next((s.name for s in self.signature.outputs if s.role in _SCORES), None)
-        if scores is None or scores not in expected or expected[scores].shape[-1] != sum(self.signature.branches):
-            return None
-        found = ties(
-            expected[scores], self.signature.branches, self.tolerance(scores, participant), rounding.get(scores)
-        )
-        return found if found.shape == expected[name].shape else None
+        if scores is None or scores not in expected or expected[scores].shape[-1] != sum(branches):
+            return []
+        if got.shape != (len(expected[scores]), len(branches)):
+            return []
+        made = self._comparable({scores: expected[scores]})[scores]
+        tolerance, explained = self._choice_tolerance(name, participant), rounding.get(scores, 0.0)
+        ceiling = self._ceiling(scores, made)
+        told = score_bounds(made, branches, tolerance, np.where(explained < OPEN * ceiling, explained, 0.0))
+        widest = score_bounds(made, branches, tolerance, np.minimum(explained, ceiling))
+        found = [(TIE, is_marked(near_best(*told, branches), got, branches))]
+        found.append((CHAOS, is_marked(near_best(*widest, branches), got, branches)))
+        if scores in hulls:
+            wide, there = hulls[scores], hulls[scores].open
+            low, high = np.where(there, wide.low, told[0]), np.where(there, wide.high, told[1])
+            found.append((NOT_FROM_ZERO, is_marked(near_best(low, high, branches), got, branches)))
+        return found
+
+    def _choice_tolerance(self, name: str, participant: Participant) -> Tolerance:
+        """How near scores are that decide nothing: a tolerance of numbers frees no decision, a rule for it does."""
+        rules = [rule for rule in self.options.rules if rule.output == name]
+        found = tolerance_by_rules(rules, self.tested.name, participant.format, participant.runtime, name)
+        return found or Tolerance()

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from converters.formats.registry import KERNELS, WRITTEN
 from converters.runtimes.pool import INDEPENDENT
 from exporter.tables import count_text
+from exporter.verify.excuses import add_forgiven
 from exporter.verify.findings import Accepted, Decisions, Draws, Failure, Finding, Played, Size, Undecided
 
 if TYPE_CHECKING:
@@ -84,8 +85,8 @@ def verdict(report: ParityReport) -> str:
         checked, played = _checkers(says), _players(says)
         accepted = f"{checked}: accepted. " if checked else ""
         plays = f". {played[:1].upper()}{played[1:]}: plays it" if played else ""
-        return f"{word}: {accepted}{agrees}{rest}{_drawn_apart(report)}{plays}"
-    return f"{word}: {_agreement(report)}{_drawn_apart(report)}"
+        return f"{word}: {accepted}{agrees}{rest}{_drawn_apart(report)}{_left_open(report)}{plays}"
+    return f"{word}: {_agreement(report)}{_drawn_apart(report)}{_left_open(report)}"
 
 
 def reference_text(report: ParityReport) -> str:
@@ -249,6 +250,14 @@ def _alone(report: ParityReport) -> str:
         if others
         else ""
     )
+
+
+def _left_open(report: ParityReport) -> str:
+    """A clause on the elements that were held to no number, by the rule that forgave them."""
+    forgiven = add_forgiven(c.forgiven for c in report.comparisons)
+    count, left = sum(c.elements for c in report.comparisons), [f for f in forgiven if f.excuse.leaves_open]
+    told = [f"{f.elements:,} of {count:,} elements left open: {f.excuse.title}" for f in left]
+    return "".join(f"; {each}" for each in told)
 
 
 def _drawn_apart(report: ParityReport) -> str:

@@ -11,7 +11,17 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from msgspec.structs import replace
 
-from exporter.verify.difference import compare, compare_all, floor_log_probs, near_best, steps, ties
+from exporter.verify.difference import (
+    compare,
+    compare_all,
+    floor_log_probs,
+    is_marked,
+    near_best,
+    score_bounds,
+    steps,
+    ties,
+)
+from exporter.verify.excuses import BOTH_NAN, CHAOS, EXCUSES, NAN_FROM_ZERO, ROUNDING, TIE, Excuse, Forgiven
 from exporter.verify.statistics import FALSE_ALARM, chi_square_survival, fit
 from exporter.verify.tolerances import ATOL, RTOL, Tolerance, tolerance_for
 from signatures.roles import Role
@@ -121,23 +131,54 @@ def test_integers_are_equal_or_not() -> None:
     a, b = np.array([[1000, 2000]]), np.array([[1000, 2001]])
     assert compare(a, a, Tolerance(5, 5)).passed
     assert not compare(a, b, Tolerance(5, 5)).passed
-    assert compare(a, b, PLAIN, free=np.array([[False, True]])).passed
-    assert not compare(a, b, PLAIN, free=np.array([[True, False]])).passed
+    forgiven = compare(a, b, PLAIN, free=[(TIE, np.array([[False, True]]))])
+    assert forgiven.passed and [(f.excuse, f.elements) for f in forgiven.forgiven] == [(TIE, 1)]
+    assert not compare(a, b, PLAIN, free=[(TIE, np.array([[True, False]]))]).passed
 
 
 def test_a_choice_is_free_where_rounding_may_turn_it() -> None:
     scores = floats(1.0, 1.001)[None]
     assert ties(scores, (2,), PLAIN).tolist() == [[False]]
-    assert ties(scores, (2,), PLAIN, np.full((1, 2), 6e-4)).tolist() == [[True]]
+    assert near_best(*score_bounds(scores, (2,), PLAIN, 6e-4), (2,)).tolist() == [[True, True]]
+    assert near_best(*score_bounds(scores, (2,), PLAIN, 4e-4), (2,)).tolist() == [[False, True]]
 
 
 def test_what_rounding_makes_of_one_score_frees_no_other() -> None:
     """As of a masked class, whose score of -1e8 rounding moves by 24."""
-    scores, moved = floats(1.0, 0.0, -1e8)[None], floats(0, 0, 94)[None]
-    assert ties(scores, (3,), PLAIN, moved).tolist() == [[False]]
-    assert near_best(floats(1.0, 0.9, -50.0)[None], (3,), PLAIN, floats(0, 0.1, 94)[None]).tolist() == [
-        [True, True, True]
-    ]
+    scores, moved = floats(1.0, 0.0, -1e8)[None], np.array([[0, 0, 94.0]])
+    assert near_best(*score_bounds(scores, (3,), PLAIN, moved), (3,)).tolist() == [[True, False, False]]
+
+
+def test_a_choice_is_one_of_those_that_are_as_good() -> None:
+    marked = np.array([[True, False, True, True, False]])
+    for first, second, right in (
+        (0, 0, [True, True]),
+        (1, 1, [False, False]),
+        (2, 2, [True, False]),
+        (-1, 9, [False, False]),
+    ):
+        assert is_marked(marked, np.array([[first, second]]), (3, 2)).tolist() == [right]
+
+
+@pytest.mark.parametrize("excuse", EXCUSES, ids=lambda e: e.title)
+def test_one_rule_alone_forgives_a_nan_beside_a_number(excuse: Excuse) -> None:
+    free = [(excuse, np.array([True, True]))]
+    found = compare(floats(1, 2), floats(1, np.nan), PLAIN, free=free, rounding=np.full(2, 1e9))
+    assert found.passed == (excuse is NAN_FROM_ZERO)
+
+
+def test_rounding_forgives_no_more_than_its_ceiling() -> None:
+    a, bounds = floats(0, 0), np.array([5.0, 5.0])
+    assert compare(a, floats(0, 4), PLAIN, rounding=bounds).passed
+    assert not compare(a, floats(0, 4), PLAIN, rounding=bounds, ceiling=3.0).passed
+    found = compare(a, floats(0, 2), PLAIN, rounding=bounds, ceiling=3.0)
+    assert found.passed and found.forgiven == (Forgiven(CHAOS, 1, 2.0),)
+    assert compare(a, floats(0, 2), PLAIN, rounding=bounds).forgiven == (Forgiven(ROUNDING, 1, 2.0),)
+
+
+def test_a_nan_on_both_sides_is_said() -> None:
+    found = compare(floats(1, np.nan, np.inf), floats(1, np.nan, np.inf), PLAIN)
+    assert found.passed and [(f.excuse, f.elements) for f in found.forgiven] == [(BOTH_NAN, 1)]
 
 
 def test_rounding_takes_the_place_of_a_smaller_tolerance() -> None:

@@ -8,6 +8,7 @@ import numpy as np
 
 from converters.policy.policy import Policy
 from exporter.verify.difference import compare, ties
+from exporter.verify.excuses import TIE
 from exporter.verify.reference import random_outputs
 from exporter.verify.tolerances import Tolerance, tolerance_for
 from signatures.roles import Role
@@ -45,7 +46,7 @@ def disagreements(policy: Policy, ours: Run, theirs: Run) -> list[str]:
             free = None
             if spec.role is Role.DETERMINISTIC and signature.branches and scores is not None:
                 free = ties(expected[scores], signature.branches, tolerance)
-            difference = compare(reference, candidate, tolerance, free=free)
+            difference = compare(reference, candidate, tolerance, free=[] if free is None else [(TIE, free)])
             if not difference.passed:
                 found.append(f"{spec.name}, {case.name}: {difference.max_abs} {difference.reason}")
     return found

@@ -12,6 +12,7 @@ from msgspec.structs import replace
 
 from converters.formats.bundle.bundle import dumps
 from exporter.verify import findings
+from exporter.verify.excuses import NOT_FROM_ZERO, ROUNDING, Forgiven
 from exporter.verify.findings import Bisection, Finding
 from exporter.verify.plays import VERDICTS, Interval, Player, PlayRecord
 from exporter.verify.report import ParityReport
@@ -43,6 +44,8 @@ WHOLE = comparison(
     smallest_tolerance=0.2,
     bisection=replace(BEGINNING, input="step 3", reason="a reason"),
     against="numpy",
+    elements=40_000,
+    forgiven=(Forgiven(NOT_FROM_ZERO, 6, float("inf")), Forgiven(ROUNDING, 60, 3e-5)),
 )
 RETURNS = Interval(9.5, 9.25, 9.75)
 REPORTS = [

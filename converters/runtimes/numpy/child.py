@@ -24,7 +24,7 @@ from converters.graph.jitter import Jitter
 from converters.graph.nodes import Graph
 from converters.graph.ops.samplers import reseed
 from converters.graph.run import run_graph
-from converters.graph.underflow import Ends
+from converters.graph.underflow import End, Whole
 from signatures.errors import ExportModelError
 
 
@@ -35,22 +35,9 @@ class _Model:
     def run(self, feeds: Tensors, fetch: Sequence[str], request: Mapping[str, Any]) -> Tensors:
         seed = request.get("jitter")
         jitter = None if seed is None else Jitter(seed, request.get("arithmetic", "processor"))
-        if request.get("undetermined"):
-            return self._open_elements(feeds, fetch, request["arithmetic"])
+        if (end := request.get("end")) is not None:
+            jitter = Whole(0) if end == "float64" else End(request["arithmetic"], kept=end == "kept")
         return self.compute(feeds, fetch, jitter)
-
-    def _open_elements(self, feeds: Tensors, fetch: Sequence[str], arithmetic: str) -> Tensors:
-        """Infinite where a number rests on one that is not told from zero, else 0."""
-        ends = Ends(arithmetic)
-        zero = self.compute(feeds, fetch, ends)
-        ends.keep(mark=False)
-        kept = self.compute(feeds, fetch, ends)
-        ends.keep(mark=True)
-        marked = self.compute(feeds, fetch, ends)
-        return {
-            n: np.where(np.isnan(marked[n]) & ~(np.isnan(zero[n]) & np.isnan(kept[n])), np.inf, 0).astype(np.float32)
-            for n in marked
-        }
 
 
 def _load(header: Mapping[str, Any]) -> _Model:

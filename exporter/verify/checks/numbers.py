@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 from msgspec.structs import replace
 
 from converters.formats.registry import narrows
 from exporter.verify.difference import Difference, add_histograms, wrong
-from exporter.verify.findings import Bisection, Finding, Numbers, Shape
+from exporter.verify.excuses import add_forgiven
+from exporter.verify.findings import Bisection, Finding, Numbers, Shape, undecided_finding
 from exporter.verify.participants import Feeds, Participant
 from exporter.verify.trial import Trial
 from signatures.roles import Role
@@ -20,11 +22,13 @@ from signatures.spec import PolicySignature
 def numbers(trial: Trial, participant: Participant) -> Iterator[Finding]:
     """The worst difference of each output, and where it begins; of a drawn one its shape, dtype and range.
 
-    Every runtime is given the first input and what was recorded; a slow one of the others as many as it has time for.
+    Every runtime is given the first input, what was recorded and the steps with memory; a slow one of the other inputs
+    as many as it has time for.
     """
     worst: dict[str, tuple[Difference, Case]] = {}
     every: dict[str, list[Difference]] = {}
     allowance, recorded = trial.allowance(participant), len(trial.golden.cases)
+    allowance.left -= 2 * len(trial.steps)
     tried: list[tuple[Case, Feeds]] = []
     for number, (case, expected) in enumerate(zip(trial.cases, trial.expected, strict=True)):
         optional = 0 < number < len(trial.cases) - recorded
@@ -51,13 +55,37 @@ def numbers(trial: Trial, participant: Participant) -> Iterator[Finding]:
         kind = Shape if trial.is_drawn(name, participant) else Numbers
         needed = largest([d.smallest_tolerance for d in every[name]])
         counted = add_histograms(d.histogram for d in every[name])
-        share = max(d.share for d in every[name])
-        difference = replace(difference, smallest_tolerance=needed, histogram=counted, share=share)
+        difference = sum_differences(difference, every[name], smallest_tolerance=needed, histogram=counted)
         begins = trial.bisect(participant, name, difference, case.feeds)
         if difference.passed and (other := _upstream(trial, name, rounded)) is not None:
             difference = replace(difference, passed=False, reason=f"the constant {other.tensor} has another value")
             begins = other
         yield trial.finding(kind, participant, name, difference, case.name, bisection=begins)
+        if difference.passed:
+            yield from _mostly_open(
+                participant, name, [d for d, c in zip(every[name], cases, strict=True) if c.ordinary]
+            )
+
+
+def _mostly_open(participant: Participant, name: str, ordinary: Sequence[Difference]) -> Iterator[Finding]:
+    """A finding where rules that hold an answer to no number forgave half the elements at ordinary inputs."""
+    forgiven = [f for f in add_forgiven(d.forgiven for d in ordinary) if f.excuse.leaves_open]
+    count, left = sum(d.elements for d in ordinary), sum(f.elements for f in forgiven)
+    if forgiven and 2 * left >= count:
+        titles = " and ".join(f.excuse.title for f in forgiven)
+        reason = f"{left:,} of {count:,} elements of {name} were left open at ordinary inputs: {titles}"
+        yield undecided_finding(participant.name, participant.runtime, name, reason)
+
+
+def sum_differences(worst: Difference, every: Sequence[Difference], **changes: Any) -> Difference:
+    """The worst of several differences, with the elements, shares and what was forgiven of all of them."""
+    return replace(
+        worst,
+        share=max(d.share for d in every),
+        elements=sum(d.elements for d in every),
+        forgiven=add_forgiven(d.forgiven for d in every),
+        **changes,
+    )
 
 
 def _upstream(trial: Trial, name: str, constants: Sequence[Bisection]) -> Bisection | None:

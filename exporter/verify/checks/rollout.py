@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from msgspec.structs import replace
 
-from exporter.verify.checks.numbers import largest, rank
+from exporter.verify.checks.numbers import largest, rank, sum_differences
 from exporter.verify.difference import Difference
 from exporter.verify.findings import Finding, Rollout
 from exporter.verify.participants import Feeds, Participant
@@ -18,8 +18,6 @@ def rollout(trial: Trial, participant: Participant) -> Iterator[Finding]:
     """How far each output drifts, and the step where that begins."""
     memory = trial.signature.memory
     if not trial.steps or memory is None or memory.output not in participant.outputs:
-        return
-    if not trial.allowance(participant).takes(2 * len(trial.steps), f"{len(trial.steps)} steps with memory"):
         return
     fed: list[Feeds] = []
 
@@ -35,8 +33,7 @@ def rollout(trial: Trial, participant: Participant) -> Iterator[Finding]:
     for name, differences in steps.items():
         worst = max(range(len(fed)), key=lambda i: rank(differences[i]))
         least = largest([d.smallest_tolerance for d in differences])
-        share = max(d.share for d in differences)
-        difference = replace(differences[worst], smallest_tolerance=least, histogram=(), share=share)
+        difference = sum_differences(differences[worst], differences, smallest_tolerance=least, histogram=())
         begins = None
         if not difference.passed:
             # An output that goes wrong after the memory did goes wrong because of it.
