@@ -11,7 +11,8 @@ from signatures.interface import Interface, Quantity, Term
 
 #: Numbers that are equal as exporters round them (mjlab: three decimals).
 _ROUNDED = 5.1e-4
-_TERM_FIELDS = ("size", "elements", "unit", "scale", "offset", "clip", "history")
+#: Fields of a term that state something.
+TERM_FIELDS = ("size", "elements", "unit", "scale", "offset", "clip", "history")
 
 
 def merge(first: Interface, second: Interface) -> tuple[Interface, tuple[str, ...]]:
@@ -49,24 +50,25 @@ def _terms(first: Sequence[Term], second: Sequence[Term], notes: list[str]) -> t
 
 def _fill(a: Term, b: Term, notes: list[str]) -> Term:
     taken: dict[str, Any] = {}
-    for name in _TERM_FIELDS:
+    for name in TERM_FIELDS:
         mine, theirs = getattr(a, name), getattr(b, name)
         if mine in (None, ()) and theirs not in (None, ()):
             size = taken.get("size", a.size)
             if not isinstance(theirs, tuple) or size is None or len(theirs) in (1, size):
                 taken[name] = theirs
-        elif theirs not in (None, ()) and not _equal(mine, theirs):
+        elif theirs not in (None, ()) and not equal_values(mine, theirs):
             notes.append(_difference(f"{name} of {a.name}", a.source, b.source))
     return replace(a, **taken, source=f"{a.source}; {b.source}"[:600]) if taken else a
 
 
-def _equal(a: Any, b: Any) -> bool:
+def equal_values(a: Any, b: Any) -> bool:
+    """Whether two values of a field are one as exporters round them; one number stands for a list of it."""
     if isinstance(a, tuple) and isinstance(b, tuple):
         if len(a) == 1 < len(b):
             a = a * len(b)
         if len(b) == 1 < len(a):
             b = b * len(a)
-        return len(a) == len(b) and all(map(_equal, a, b))
+        return len(a) == len(b) and all(map(equal_values, a, b))
     if isinstance(a, float) and isinstance(b, float):
         return abs(a - b) <= _ROUNDED
     return bool(a == b)

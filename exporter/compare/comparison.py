@@ -23,6 +23,7 @@ from converters.compiler.passes.weights import Storage
 from converters.files.children.process import LoadedModel, RunFailedError
 from converters.files.folders import scratch_folder, size_of
 from converters.formats.source import OriginalRun, ReadOptions
+from converters.interfaces.differences import interface_differences
 from converters.policy.policy import Policy
 from converters.runtimes.pool import RuntimePool, chosen_runtimes
 from exporter.compare.explaining import Explaining
@@ -33,6 +34,7 @@ from exporter.export.sources import read_source
 from exporter.remote.fetching import nearby
 from exporter.verify.checks.size import check_budget
 from exporter.verify.difference import compare
+from exporter.verify.findings import Finding, stated_finding
 from exporter.verify.options import VerifyOptions
 from exporter.verify.participants import (
     Failure,
@@ -114,7 +116,8 @@ def compare_artefacts(
         judge = judge or partial(verify, checks=(*CHECKS, explaining))
         comparison = _Comparison(policy, source, session, judge, Path(opened.enter_context(scratch_folder())))
         report = comparison.report(matched, rounded_to(reference))
-    notes = [note for m in matched for note in m.notes(policy, used)]
+    report = report.with_findings(finding for m in matched for finding in _interface_findings(policy, m))
+    notes = [note for m in matched for note in (*m.notes(policy, used), *_interface_notes(policy, m))]
     ran = any(isinstance(m, Candidate) or m.place(used)[0] is None for m in matched)
     report = replace(
         report, notes=(*report.notes, *notes, *explaining.notes), self_consistent=report.self_consistent and not ran
@@ -126,6 +129,21 @@ def compare_artefacts(
             fix="export-model runtimes lists the runtimes and how to install each; or --allow-unverified",
         )
     return report
+
+
+def _interface_findings(policy: Policy, candidate: AnyCandidate) -> Iterator[Finding]:
+    """A finding for each figure or name that a candidate states otherwise than the reference."""
+    ours, theirs = policy.signature.interface, candidate.interface
+    if ours is not None and theirs is not None:
+        for text in interface_differences(ours, theirs, candidate.input_names):
+            yield stated_finding(candidate.label, text)
+
+
+def _interface_notes(policy: Policy, candidate: AnyCandidate) -> Iterator[str]:
+    sides = {"the reference": policy.signature.interface, candidate.label: candidate.interface}
+    stating = [name for name, interface in sides.items() if interface]
+    if len(stating) == 1:
+        yield f"{stating[0]} alone states an interface: units, scales and names were not compared"
 
 
 class _Comparison(Struct, frozen=True):

@@ -27,6 +27,7 @@ from exporter.verify.participants import (
 )
 from signatures.contract import POLICY
 from signatures.errors import ExportModelError, UsageError, suggestion
+from signatures.interface import Interface
 from signatures.roles import Role
 from signatures.spec import TensorSpec
 
@@ -56,6 +57,8 @@ class Candidate(Struct, frozen=True):
     problems: tuple[Problem, ...]
     #: outputs that export-model made for the reference, and that this one has none of
     missing_ok: tuple[str, ...] = ()
+    #: what the file states of its numbers
+    interface: Interface | None = None
     #: names that its roles gave, as "the reference's = its own"
     by_role: tuple[str, ...] = ()
     #: what its weights were rounded to, where they were
@@ -65,6 +68,11 @@ class Candidate(Struct, frozen=True):
     def path(self) -> Path:
         """What a loader is given."""
         return self.ports.path
+
+    @property
+    def input_names(self) -> Mapping[str, str]:
+        """The reference's input → the name that the interface has for it."""
+        return {name: name for name in self.inputs}
 
     @property
     def forms(self) -> tuple[Format, ...]:
@@ -183,7 +191,10 @@ def _chosen(
         assert reading is not None
         return reading
     if reading is None:
-        return replace(_match(label, artefact.format, artefact.ports, policy, aliases, made), weights=weights)
+        fed = _match(label, artefact.format, artefact.ports, policy, aliases, made)
+        bundle = (artefact.place / POLICY).is_file()
+        stated = Bundle.open(artefact.place).signature.interface if bundle else None
+        return replace(fed, weights=weights, interface=stated)
     ports = (*artefact.ports.inputs, *artefact.ports.outputs)
     keys = {_base(p.tensor): _base(p.name) for p in ports if p.tensor is not None}
     own = {n: (*known, *(keys.get(o, o) for o in reading.own_names(n))) for n, known in aliases.items()}
@@ -197,7 +208,7 @@ def _chosen(
         return read if blocked or not read.missing(policy) else replace(fed, weights=weights)
     called = {**{n: p.name for n, p in fed.inputs.items()}, **fed.outputs}
     by_role = tuple(f"{n} = {other}" for n, other in called.items() if _base(other) not in aliases[n])
-    return replace(fed, weights=weights, by_role=by_role)
+    return replace(fed, weights=weights, by_role=by_role, interface=reading.policy.signature.interface)
 
 
 def labels_of(found: Sequence[Artefact]) -> list[str]:

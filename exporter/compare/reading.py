@@ -26,6 +26,7 @@ from exporter.export.sources import read_source
 from exporter.verify.original import Original
 from exporter.verify.participants import Failure, Feeds, Participant
 from signatures.errors import SourceError
+from signatures.interface import Interface
 from signatures.roles import Role
 from signatures.spec import TensorSpec
 
@@ -47,6 +48,16 @@ class ReadCandidate(Struct, frozen=True):
 
     #: what its weights were rounded to: a file that is read has them as they are
     weights: Storage | None = None
+
+    @property
+    def interface(self) -> Interface | None:
+        """What the file states of its numbers."""
+        return self.policy.signature.interface
+
+    @property
+    def input_names(self) -> Mapping[str, str]:
+        """The reference's input → the name that the interface has for it."""
+        return self.pairing.inputs
 
     @property
     def forms(self) -> tuple[Format, ...]:

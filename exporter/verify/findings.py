@@ -293,6 +293,14 @@ class Played(Accepted, frozen=True):
     wrong = "{0.format} is not played by our model of the player of {0.runtime}: {0.reason}"
 
 
+class Stated(Finding, frozen=True):
+    """What a file states of the interface, beside what the reference states; ``output`` is "interface"."""
+
+    kind = "interface"
+    words = ("alike", "differs")
+    wrong = "{0.format}: {0.reason}"
+
+
 class Size(Finding, frozen=True):
     """The bytes of a format beside its budget; ``max_abs_diff`` is what there is too many."""
 
@@ -301,7 +309,7 @@ class Size(Finding, frozen=True):
     wrong = "{0.format} is too large: {0.reason}"
 
 
-_Unanswered = TypeVar("_Unanswered", Failure, Undecided)
+_Unanswered = TypeVar("_Unanswered", Failure, Stated, Undecided)
 
 
 def failure(kind: str, runtime: str, error: RunFailedError, output: str = "*") -> Failure:
@@ -322,6 +330,11 @@ def _error_text(error: RunFailedError) -> str:
 def undecided_finding(kind: str, runtime: str, output: str, reason: str, where: str | None = None) -> Undecided:
     """What could not be compared, and why."""
     return _without_numbers(Undecided, kind, runtime, output, reason, where)
+
+
+def stated_finding(kind: str, reason: str) -> Stated:
+    """What a file states of the interface otherwise."""
+    return _without_numbers(Stated, kind, "file", "interface", reason)
 
 
 def _without_numbers(

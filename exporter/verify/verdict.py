@@ -9,13 +9,15 @@ from converters.formats.registry import KERNELS, WRITTEN
 from converters.runtimes.pool import INDEPENDENT
 from exporter.tables import count_text
 from exporter.verify.excuses import add_forgiven
-from exporter.verify.findings import Accepted, Decisions, Draws, Failure, Finding, Played, Size, Undecided
+from exporter.verify.findings import Accepted, Decisions, Draws, Failure, Finding, Played, Size, Stated, Undecided
 
 if TYPE_CHECKING:
     from exporter.verify.report import ParityReport
 
 #: What is held against the reference and is no format that was written.
 _APART = ("reference", "golden", "source", "weights")
+#: Findings that the verdict tells in words of their own.
+_OWN_WORDS = (Accepted, Decisions, Failure, Size, Stated)
 _TITLES = {"tensorflow": "TensorFlow"}
 
 
@@ -31,7 +33,7 @@ def key_of(label: str) -> str:
 
 def formats_of(report: ParityReport) -> list[str]:
     """Return what was to be compared: the formats that were written, or the files that were given."""
-    found = [c.format for c in report.comparisons if c.format not in _APART and not isinstance(c, Size)]
+    found = [c.format for c in report.comparisons if c.format not in _APART and not isinstance(c, Size | Stated)]
     return list(dict.fromkeys([*report.sizes, *(_whole(label, report) for label in found)]))
 
 
@@ -58,7 +60,7 @@ def _whole(label: str, report: ParityReport) -> str:
 
 
 def _numbers(found: Finding) -> bool:
-    return found.format not in _APART and not isinstance(found, Accepted | Failure | Undecided | Size)
+    return found.format not in _APART and not isinstance(found, Accepted | Failure | Stated | Undecided | Size)
 
 
 def verdict(report: ParityReport) -> str:
@@ -201,10 +203,10 @@ def _release(names: Sequence[str]) -> str:
 def _wrong(report: ParityReport) -> list[str]:
     """What is wrong, by kind, and which format stands alone with it."""
     failed = [c for c in report.failures if c.disagrees]
-    measured = [c for c in failed if not isinstance(c, Accepted | Decisions | Failure | Size)]
+    measured = [c for c in failed if not isinstance(c, _OWN_WORDS)]
     told = []
     if measured:
-        count = sum(not isinstance(c, Accepted | Decisions | Failure | Size) for c in report.comparisons)
+        count = sum(not isinstance(c, _OWN_WORDS) for c in report.comparisons)
         all_of = count_text(count, "comparison")
         told.append(f"{len(measured)} of {all_of} disagree with {reference_text(report)}{_alone(report)}")
     for kind, words in (
@@ -213,14 +215,22 @@ def _wrong(report: ParityReport) -> list[str]:
         (Played, "not played by our model of Unity's player: {}"),
         (Accepted, "refused by Unity's checks: {}"),
         (Size, "too large: {}"),
+        (Stated, "the interface differs: {}"),
     ):
         if kind is Accepted and (by := _loaders([c.runtime for c in failed if type(c) is kind])):
             told.append(f"refused by {by}")
             continue
-        names = [c.output if kind is Decisions else c.runtime if issubclass(kind, Accepted) else
-                 c.format if kind is Size else c.where for c in failed if type(c) is kind]  # fmt: skip
+        names = [_name_in_verdict(c) for c in failed if type(c) is kind]
         told += [words.format(", ".join(dict.fromkeys(names)))] if names else []
     return told
+
+
+def _name_in_verdict(found: Finding) -> str:
+    if isinstance(found, Accepted):
+        return found.runtime
+    if isinstance(found, Stated):
+        return found.reason
+    return found.output if isinstance(found, Decisions) else found.format if isinstance(found, Size) else found.where
 
 
 def _alone(report: ParityReport) -> str:
