@@ -24,8 +24,12 @@ ROOMS = ("exporter/verify", "exporter/compare")
 #: What reads and words, and judges nothing; other rooms' tests are for these.
 _WORDS = ("verdict", "findings", "report", "npy", "plays", "options", "session", "golden", "tolerance_file", "__init__")
 #: Tests that start no runtime, the cheapest first.
-TESTS = ("tests/verify/test_bounds.py", "tests/exporter/test_comparison.py", "tests/verify")
-SECONDS = 90
+TESTS = (
+    *("tests/verify/test_bounds.py", "tests/exporter/test_comparison.py", "tests/verify"),
+    *("tests/compare/test_ports.py", "tests/compare/test_budget.py", "tests/exporter/test_bisection.py"),
+    *("tests/exporter/test_verification.py", "tests/exporter/test_what_is_compared.py"),
+)
+SECONDS = 240
 _COMPARED = {
     ast.Lt: ast.LtE,
     ast.LtE: ast.Lt,
@@ -111,7 +115,7 @@ class _Breaker(ast.NodeTransformer):
         self.found += [(own, kind, getattr(node, "lineno", 0), what) for kind, (what, _) in enumerate(made)]
         if self.wanted is not None and own == self.wanted[0]:
             return ast.copy_location(made[self.wanted[1]][1], node)
-        if isinstance(node, ast.FunctionDef):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
             node.body = [self.visit(each) for each in node.body]  # type: ignore[misc]
             return node
         return self.generic_visit(node)
