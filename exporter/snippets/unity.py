@@ -70,7 +70,7 @@ def _settings(bundle: Bundle, able: Sequence[Generation]) -> list[str]:
     scope = _scope(bundle)
     vectors = [s for s in signature.inputs if s.role is Role.VECTOR]
     images = [s for s in signature.inputs if s.role is Role.VISUAL]
-    newest = able[-1]
+    newest = next((g for g in able if bundle.made_for == f"tfsharp-{g.name[-3:]}"), able[-1])  # whose fields they are
     rows: list[tuple[str, str]] = [
         ("Graph Model", bundle.name),
         ("Graph Scope", scope.rstrip("/") + ("/ (0.3 and newer add the slash themselves)" if scope else "(empty)")),
