@@ -12,6 +12,7 @@ import math
 import struct
 from collections.abc import Mapping
 from functools import cache
+from operator import index
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -19,6 +20,8 @@ import numpy as np
 Tensors = dict[str, np.ndarray]
 #: Bytes that are taken from a pipe at once.
 _CHUNK = 1 << 20
+#: The most bytes of a frame's header, and of its tensors together (weights come back from Keras).
+MAX_HEADER_BYTES, MAX_TENSOR_BYTES = 1 << 26, 1 << 34
 
 
 class FramingError(Exception):
@@ -42,19 +45,28 @@ def write_frame(stream: BinaryIO, header: Mapping[str, Any], tensors: Mapping[st
     stream.flush()
 
 
-def read_frame(stream: BinaryIO) -> tuple[dict[str, Any], Tensors]:
-    """Receive a frame; raises EOFError at the end of the stream, FramingError where it is none."""
+def read_frame(stream: BinaryIO, most: int = MAX_TENSOR_BYTES) -> tuple[dict[str, Any], Tensors]:
+    """Receive a frame; raises EOFError at the end of the stream, FramingError where it is none.
+
+    ``most``: bytes that its tensors may have together.
+    """
     (length,) = struct.unpack("<I", _exactly(stream, 4))
+    if length > MAX_HEADER_BYTES:
+        raise FramingError(f"its header is said to have {length} bytes")
     text = _exactly(stream, length)
     tensors: Tensors = {}
     try:
         header: dict[str, Any] = json.loads(text)
         for entry in header.get("tensors", ()):
             dtype = np.dtype(entry["dtype"])
-            data = _exactly(stream, math.prod(entry["shape"]) * dtype.itemsize)
+            size = math.prod(map(index, entry["shape"])) * dtype.itemsize  # of nothing but integers
+            most -= size
+            if most < 0 or size < 0:
+                raise ValueError("its tensors are larger than an answer may be")
+            data = _exactly(stream, size)
             array = np.frombuffer(data, dtype.newbyteorder("<")).astype(dtype, copy=False)
             tensors[entry["name"]] = array.reshape(entry["shape"])
-    except (ValueError, LookupError, TypeError, AttributeError, RecursionError, SyntaxError) as error:
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError, SyntaxError, OverflowError) as error:
         raise FramingError(f"what it said cannot be read as a frame: {error}") from error
     return header, tensors
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from converters.files.children.confinement import in_force
 from converters.files.children.environment import child_environment, readable_places
-from converters.files.children.frames import FramingError, Tensors, read_frame, write_frame
+from converters.files.children.frames import MAX_TENSOR_BYTES, FramingError, Tensors, read_frame, write_frame
 from converters.files.children.memory_limits import Memory
 from converters.files.children.python import confined_command
 from converters.files.children.time_limits import processor_time, time_limit
@@ -33,6 +33,8 @@ TIMEOUT = 300.0
 #: Seconds after which it is looked at again whether one has taken too long.
 _LOOK = 1.0
 
+#: The most bytes of an answer of a program that anyone may have made.
+_MAX_FOREIGN_BYTES = 1 << 28
 #: In the place of what a program said that anyone may have made.
 _UNSAID = "what it said is not repeated (-v prints it)"
 #: Where in its folder a process writes; beside it lies what it is handed, to be read alone.
@@ -229,7 +231,7 @@ class RuntimeProcess(AbstractContextManager["RuntimeProcess"]):
             self._asked, self._busy = time.monotonic(), True
             if send is not None:
                 send(to)
-            answer, results = read_frame(back)
+            answer, results = read_frame(back, MAX_TENSOR_BYTES if self._own_words is None else _MAX_FOREIGN_BYTES)
             self._busy = False
         except (OSError, EOFError, FramingError) as error:
             status = _wait_or_kill(process)
