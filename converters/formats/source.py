@@ -11,7 +11,6 @@ from msgspec import Struct, field
 from msgspec.structs import replace
 
 from converters.files import tensorflow_messages as schema
-from converters.files.children.process import RunFailedError
 from converters.files.external_data import Detached
 from converters.files.folders import scratch_folder
 from converters.formats.frozen_graph.subgraph import check, subgraph
@@ -61,6 +60,8 @@ class OriginalRun(Struct, frozen=True):
                 try:
                     file = self.copy(folder)
                 except ExportModelError as error:
+                    from converters.files.children.process import RunFailedError  # an export alone starts no process
+
                     raise RunFailedError("cannot be given to its runtime", why=f"{error.what}: {error.why}") from error
                 yield str(file), self.options
                 return
