@@ -22,7 +22,7 @@ from converters.policy.policy import Policy
 from converters.runtimes.pool import RuntimePool, chosen_runtimes
 from exporter.export.job import Job, own_in, runs_elsewhere
 from exporter.export.options import storage_of
-from exporter.export.pipeline import BEFORE_BAKE, UNDER_OWN_NAMES, Progress, consumer, join_reports
+from exporter.export.pipeline import Progress, consumer, join_reports
 from exporter.export.remade import baked_again, compiled_again, made_again, read_back, tensors
 from exporter.export.sources import Source, read_source
 from exporter.verify.checks.decisions import decisions
@@ -112,6 +112,8 @@ def verify_folder(
         assert form.held is not None
         with naming(found.path(form)):
             found.verify_contract(form.held(found.path(form)))
+            if form.misstated is not None and (what := form.misstated(found.path(form), found.signature)) is not None:
+                raise unfit(found.path(form), what, f"it is not what {POLICY} says of the interface")
     own = case.judge or FROZEN_GRAPH
     if case.judge is None and case.made_for is None and given.again is None:
         again, own = read_back(found)
@@ -169,7 +171,7 @@ def _evidence_of(found: Bundle, read: Source) -> _Given:
     """What the source says of a bundle. Raises BundleError where it is another, or means something else."""
     contract, made_for = found.contract, found.contract.tool.get("profile")
     if contract.tool.get("bake") is not None:
-        return _Given(read, again=baked_again(read, contract))
+        return _Given(read, _original_of(read, contract), baked_again(read, contract))
     if made_for is None:
         original = _original_of(read, contract)
         _check_meaning(read, contract, found.folder)
@@ -244,20 +246,21 @@ def _run(
             batch=found.contract.tool.get("batch"),
             code=CodeOptions.of(found.contract.tool),
             runs_elsewhere=given.source is not None and runs_elsewhere(given.source),
+            before=again.own if again is not None and again.bake else None,
         )
         weights = found.contract.tool.get("weights")
         # What was rounded is held against itself; the source is asked what it decides.
-        held = replace(tested, source=None) if weights else tested
+        held = replace(tested, source=None, before=None) if weights else tested
         session = Session(() if case.asked else running, known, pool, options or VerifyOptions(), progress)
         report = verify(held, session)
         if weights and given.original is not None:
             decided = decisions(tested, held, storage_of(weights), replace(session, runtimes=running))
             ran = given.original.runtime if decided and given.original.runtime in used else None
             report = replace(report.with_findings(decided), self_consistent=False, original=ran)
-        if again is not None and again.own is not None:
+        if again is not None and again.own is not None and not again.bake:
             under = own_in(again, case.formats, scratch / "own")
             other = verify(under, Session(running, known, pool, progress=progress))
-            report = join_reports(report, other, BEFORE_BAKE if again.bake else UNDER_OWN_NAMES)
+            report = join_reports(report, other)
     return report
 
 

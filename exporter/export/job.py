@@ -45,7 +45,7 @@ class Job(Struct, frozen=True):
     model: SourceModel
     policy: Policy
     profile: Profile | None = None
-    #: the policy under its own names, where ``policy`` has those of a consumer
+    #: the policy under its own names, where ``policy`` has those of a consumer; before its action was baked
     own: Policy | None = None
     #: why it has another name than its source's
     note: str | None = None
@@ -167,11 +167,12 @@ def under_test(job: Job, stage: Path, artifacts: Sequence[Artifact], scratch: Pa
         paths,
         scratch,
         sizes={a.format.key: a.size for a in artifacts},
-        source=job.model.original if job.own is None and job.whole is None else None,
+        source=job.model.original if (job.own is None or job.bake) and job.whole is None else None,
         profile=None if job.profile is None else job.profile.name,
         batch=job.batch,
         code=job.code,
         runs_elsewhere=runs_elsewhere(job.source),
+        before=job.own if job.bake and job.whole is None else None,
     )
 
 
@@ -276,7 +277,7 @@ def check_bake(options: ExportOptions) -> None:
 
 
 def bake(job: Job, what: str) -> Job:
-    """The policy whose graph computes what is stated of its action; its own is compared with the source."""
+    """The policy whose graph computes what is stated of its action; ``own`` is the one before."""
     from converters.compiler.passes.bake import BAKED
 
     with naming(job.source.path):

@@ -240,10 +240,10 @@ class Exporter:
                 session = Session(self.runtimes, self._known, pool, options.parity, progress)
                 beside = replace(session, options=replace(options.parity, rules=(), golden=None, budget={}, require=()))
                 report = verify(tested, session)
-                if job.own is not None:
+                if job.own is not None and not job.bake:
                     under = own_in(job, self._formats, folder / "own")
                     other = verify(under, beside)
-                    report = join_reports(report, other, BEFORE_BAKE if job.bake else UNDER_OWN_NAMES)
+                    report = join_reports(report, other)
                 if job.whole is not None:
                     from exporter.verify.checks.decisions import decisions
 
@@ -392,7 +392,6 @@ def _formats(options: ExportOptions, wanted: Profile | None) -> list[Format]:
 
 #: What a second policy of a report is.
 UNDER_OWN_NAMES = "the policy under its own names, from which this was made"
-BEFORE_BAKE = "the policy before its action was scaled (--bake actions), from which this was made"
 
 
 def join_reports(

@@ -8,7 +8,7 @@ rows only is run that many rows at a time.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -26,8 +26,16 @@ MAX_ROWS = 1 << 16
 class Original:
     """The source, loaded in a runtime that reads it by itself; answers like a policy."""
 
-    def __init__(self, model: LoadedModel, signature: PolicySignature, source: SourceMap) -> None:
+    def __init__(
+        self,
+        model: LoadedModel,
+        signature: PolicySignature,
+        source: SourceMap,
+        then: Callable[[Arrays], dict[str, np.ndarray]] | None = None,
+    ) -> None:
+        """``then``: what the judge makes of each answer, where the policy computes more than its source."""
         self.model = model
+        self._then = then
         self.signature = signature
         self.source = source
         if source.rows is not None and not 0 < source.rows <= MAX_ROWS:
@@ -95,7 +103,7 @@ class Original:
             first, *rest = [next(answers) for _ in range(length)]
             joint = {name: np.concatenate([first[name], *(r[name] for r in rest)])[:count] for name in first}
             results.append(joint if wanted is not None and wanted != count else first)
-        return results
+        return results if self._then is None else [self._then(answer) for answer in results]
 
     def _some_rows(self, feeds: Arrays, first: int, count: int) -> dict[str, np.ndarray]:
         """``count`` rows from ``first`` on, the last one repeated where there are not as many."""

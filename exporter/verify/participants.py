@@ -64,6 +64,8 @@ class PolicyUnderTest(Struct, frozen=True, kw_only=True):
     code: CodeOptions = CodeOptions()
     #: whether a library that is here runs the source by itself, though verification does not ask it
     runs_elsewhere: bool = False
+    #: the policy before its action was baked: the source answers as that, and the judge applies what is stated
+    before: Policy | None = None
 
 
 def write_reference(policy: Policy, folder: Path, name: str = "reference") -> Path:
@@ -89,6 +91,7 @@ def policy_under_test(
     batch: int | None = None,
     code: CodeOptions | None = None,
     runs_elsewhere: bool = False,
+    before: Policy | None = None,
 ) -> PolicyUnderTest:
     """Return what is verified of a policy and its ``artefacts`` (format → path that a loader is given).
 
@@ -113,6 +116,7 @@ def policy_under_test(
         batch=batch,
         code=code or CodeOptions(),
         runs_elsewhere=runs_elsewhere,
+        before=before,
     )
 
 

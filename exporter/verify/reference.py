@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, suppress
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from converters.formats.registry import FROZEN_GRAPH, WRITTEN
 from converters.graph.nodes import Graph
 from converters.graph.ops.samplers import SAMPLERS
 from converters.runtimes.pool import RuntimePool
+from exporter.verify.baked import apply_stated
 from exporter.verify.drawn_columns import drawn_columns
 from exporter.verify.findings import Undecided, undecided_reference
 from exporter.verify.original import Original
@@ -59,7 +61,8 @@ class Reference(AbstractContextManager["Reference"]):
             self.failures.append(undecided_reference("source", source.runtime, error))
             return
         self._loaded.append(model)
-        self.original = Original(model, self.signature, tested.source_map)
+        stated = None if tested.before is None else partial(apply_stated, tested.before.signature)
+        self.original = Original(model, self.signature, tested.source_map, stated)
         self.name = f"source/{source.runtime}"
 
     def participant(

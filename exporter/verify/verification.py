@@ -9,6 +9,7 @@ from msgspec.structs import replace
 from converters.files.children.process import LoadedModel, RunFailedError
 from converters.runtimes.pool import INDEPENDENT
 from exporter.verify.checks.agents import agents
+from exporter.verify.checks.baked import check_baked
 from exporter.verify.checks.consumer import consumers
 from exporter.verify.checks.densities import densities
 from exporter.verify.checks.draws import draws
@@ -88,6 +89,7 @@ def _findings(
         ]
     findings += check_recording(trial)
     findings += check_defined(trial)
+    findings += check_baked(trial)
 
     def add_failure(kind: str, runtime: str, error: RunFailedError, output: str) -> None:
         findings.append(failure(kind, runtime, error, output))

@@ -12,6 +12,7 @@ import onnx
 import pytest
 from onnx import helper, numpy_helper
 
+from converters.compiler.passes import bake
 from signatures.contract import POLICY
 from tests.commands import Ran, export_model
 from tests.interfaces.made import SEEN, mjlab, run_with
@@ -148,6 +149,35 @@ def test_verify_finds_what_a_file_applies_twice(tmp_path: Path, fault: str) -> N
     _rehash(folder, "policy.onnx")
     ran = export_model("verify", folder, "--runtimes", "onnxruntime")
     assert ran.status == 1 and "action" in ran.out
+
+
+WRONG = {
+    "another scale": lambda step: bake._Step(step.clip, [1.1 * x for x in step.scale], step.offset),
+    "no offset": lambda step: bake._Step(step.clip, step.scale),
+    "no clip": lambda step: bake._Step([(None, None)] * len(step.scale), step.scale, step.offset),
+    "joints exchanged": lambda step: bake._Step(step.clip[::-1], step.scale[::-1], step.offset[::-1]),
+}
+
+
+@pytest.mark.parametrize("runtimes", ["onnxruntime", "js"])
+@pytest.mark.parametrize("fault", WRONG)
+def test_a_wrong_bake_is_found(fault: str, runtimes: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All files have it alike: by the source's own action, or by our kernels', with what is stated applied apart."""
+    made = bake._whole
+    monkeypatch.setattr(bake, "_whole", lambda terms, width: WRONG[fault](made(terms, width)))
+    ran = baked(tmp_path, "--to", "bytes,onnx,tfjs", "--verify", runtimes)
+    assert ran.status == 1
+    assert "action differs by" in ran.out
+
+
+def test_a_baked_bundle_is_judged_by_its_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as planted:
+        made = bake._whole
+        planted.setattr(bake, "_whole", lambda terms, width: WRONG["no clip"](made(terms, width)))
+        assert baked(tmp_path, "--to", "bytes,onnx", "--verify", "none").status == 0
+    source = tmp_path / "exported" / "policy.onnx"
+    ran = export_model("verify", tmp_path / "out", "--source", source, "--runtimes", "onnxruntime")
+    assert ran.status == 1 and "action differs by" in ran.out
 
 
 def _log(folder: Path, action: np.ndarray, state: np.ndarray) -> Path:

@@ -34,6 +34,7 @@ FORMATS = (
         narrow=True,
         fixed=True,
         held=_artifact.embedded_contract,
+        misstated=_artifact.misstated,
         ports=_artifact.ports,
         vetted=_vetted.safe_copy,
         inner=_artifact.inner,

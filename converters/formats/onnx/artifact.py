@@ -22,6 +22,7 @@ from converters.formats.onnx.messages import files_of
 from converters.formats.onnx.proto import array_of, decode_model, dtype_name, load_external
 from converters.formats.onnx.tensor_map import TENSORS_KEY, loads
 from signatures.contract import EMBEDDED
+from signatures.spec import PolicySignature
 
 
 def ports(path: Path) -> Ports:
@@ -43,6 +44,21 @@ def embedded_contract(path: Path) -> str | None:
     """The contract that a model of ours embeds. Raises SourceError, DamagedFileError."""
     model = decode_model(read_bytes(path), Detached())
     return next((str(p.value) for p in model.metadata_props if p.key == EMBEDDED), None)
+
+
+def stated_metadata(signature: PolicySignature) -> Mapping[str, str]:
+    """Return the source's own metadata; none where the graph computes its scales: they would be applied twice."""
+    interface = signature.interface
+    return {} if interface is None or interface.baked else interface.metadata
+
+
+def misstated(path: Path, signature: PolicySignature) -> str | None:
+    """The key of a model's metadata that is not what the source stated; None where all are. Raises SourceError."""
+    model = decode_model(read_bytes(path), Detached())
+    found = {str(p.key): str(p.value) for p in model.metadata_props if p.key not in (EMBEDDED, TENSORS_KEY)}
+    stated = stated_metadata(signature)
+    other = sorted(key for key in found.keys() | stated.keys() if found.get(key) != stated.get(key))
+    return f"its metadata has {other[0]!r} as {str(found.get(other[0], 'missing'))[:80]!r}" if other else None
 
 
 @contextmanager

@@ -20,6 +20,7 @@ from converters.files.external_data import LARGE, Detached
 from converters.formats.format import WriteOptions
 from converters.formats.intermediate_tensors import View
 from converters.formats.onnx import messages
+from converters.formats.onnx.artifact import stated_metadata
 from converters.formats.onnx.messages import files_of
 from converters.formats.onnx.peephole import pooled_first, simplify_nodes
 from converters.formats.onnx.tensor_map import TENSORS_KEY, TensorMap
@@ -303,17 +304,15 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
         producer=PRODUCER,
         ir_version=IR_VERSIONS[options.opset],
         opset=options.opset,
-        props={**_stated_metadata(policy), EMBEDDED: options.contract, **({TENSORS_KEY: tensors} if tensors else {})},
+        props={
+            **stated_metadata(policy.signature),
+            EMBEDDED: options.contract,
+            **({TENSORS_KEY: tensors} if tensors else {}),
+        },
     )
     if options.checked:
         _check(model, builder.detached, policy.name)
     return files_of(model, builder.detached, f"{policy.name}.onnx")
-
-
-def _stated_metadata(policy: Policy) -> Mapping[str, str]:
-    """Return the source's own metadata; none where the graph computes its scales: they would be applied twice."""
-    interface = policy.signature.interface
-    return {} if interface is None or interface.baked else interface.metadata
 
 
 def _check(model: Any, detached: Detached, name: str) -> None:

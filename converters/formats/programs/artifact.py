@@ -9,11 +9,13 @@ from pathlib import Path
 from converters.files.children.confinement import in_force
 from converters.files.fetch import read_bytes
 from converters.formats.format import Port, Ports
+from converters.formats.programs.comment import LINE, interface_lines
 from converters.formats.programs.members import answers
 from converters.formats.programs.weights import weights_name
 from signatures.code import CodeOptions
 from signatures.contract import EMBEDDED, Contract, json_of, parse
 from signatures.errors import DamagedFileError, UnsupportedOpError
+from signatures.spec import PolicySignature
 
 #: What a file's ending says of its format.
 WRITTEN_AS = {".h": "c", ".cs": "csharp", ".mjs": "js"}
@@ -24,6 +26,17 @@ def held(path: Path) -> str | None:
     """Return the contract that a file of ours has as a comment. Raises SourceError."""
     _, found, rest = read_bytes(path).partition(_MARK)
     return rest.partition(b"\n*/")[0].decode("ascii", "replace") if found else None
+
+
+def misstated(path: Path, signature: PolicySignature) -> str | None:
+    """The line of a file's comment on its numbers that a signature does not say; None where there is none."""
+    comment = read_bytes(path).partition(_MARK)[0].decode("ascii", "replace")
+    found = [line for line in comment.splitlines() if line.startswith(LINE)]
+    stated = interface_lines(signature).splitlines()
+    if found == stated:
+        return None
+    other = next((line for line in (*found, *stated) if (line in found) != (line in stated)), "in another order")
+    return f"its comment on the numbers differs: {other.removeprefix(LINE)[:120]}"
 
 
 def contract_held(path: Path) -> Contract:

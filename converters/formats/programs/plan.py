@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 
 import numpy as np
@@ -11,6 +10,7 @@ from msgspec import Struct
 from converters.compiler.targets import PROGRAM, prepare
 from converters.files.chunks import Pieces
 from converters.formats.format import WriteOptions
+from converters.formats.programs.comment import escape, interface_lines
 from converters.formats.programs.members import Field, Header, header_of
 from converters.formats.programs.weights import Weights, weights_name, weights_of
 from converters.graph.ops.table import traits
@@ -19,13 +19,11 @@ from converters.graph.program import Program, program_of
 from converters.graph.run import run_graph
 from converters.graph.shapes import numbers_made
 from converters.graph.size_limits import MAX_COMPUTED
-from converters.interfaces.text import ALL, loop_lines, term_lines
 from converters.policy.policy import Policy
 from signatures.code import CodeOptions
 from signatures.contract import EMBEDDED
 from signatures.errors import GraphError, UnsupportedOpError, UsageError
 from signatures.roles import Role
-from signatures.spec import PolicySignature
 
 #: Golden rows of the self test, and how far float32 may be off.
 ROWS = 3
@@ -117,12 +115,12 @@ def _plan(policy: Policy, options: WriteOptions) -> Plan:
                 why=f"its shape {list(f.spec.shape)} says {f.size}",
                 fix="mend the shapes that the source declares, or export to onnx, saved_model, tfjs or bytes",
             )
-    contract = _in_comment(options.contract)
+    contract = escape(options.contract)
     sizes = tuple(policy.signature.branches)
     checked, golden = _golden(policy, header)
     weights = weights_of(program, options.weights, in_file=code.weights == "file")
     guarded = () if code.guard is None else _guarded(policy.name, header, code.guard)
-    text = f"{_interface_lines(policy.signature)}   {EMBEDDED}: {contract}\n*/"
+    text = f"{interface_lines(policy.signature)}   {EMBEDDED}: {contract}\n*/"
     return Plan(
         header=header,
         program=program,
@@ -153,19 +151,6 @@ def _guarded(name: str, header: Header, most: float) -> tuple[Guarded, ...]:
             fix="leave --guard out",
         )
     return tuple(found)
-
-
-def _in_comment(text: str) -> str:
-    text = "".join(c if c.isascii() else json.dumps(c)[1:-1] for c in text)
-    return text.replace("*/", "*\\/").replace("/*", "/\\u002a")
-
-
-def _interface_lines(signature: PolicySignature) -> str:
-    """Comment lines on what is stated of the numbers; none can be taken for the contract's, which begins otherwise."""
-    specs = (*signature.inputs, *(head.spec for head in signature.heads))
-    named = [(s.name, line) for s in specs for line in term_lines(signature, s.name)]
-    lines = [*(f"{name}: {line}" for name, line in named), *loop_lines(signature.interface, ALL)]
-    return "".join(f"   | {_in_comment(' '.join(line.split()))}\n" for line in lines)
 
 
 def formula(field: Field, floats: str) -> str:
