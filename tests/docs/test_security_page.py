@@ -7,6 +7,7 @@ import re
 import pytest
 
 from tests.commands import ROOT
+from tests.runtimes.test_confinement import ATTEMPTS
 
 PAGE = (ROOT / "docs/security.md").read_text(encoding="utf-8")
 BODY, *_ = PAGE.partition("## What is not defended")
@@ -50,6 +51,10 @@ def test_a_probe_is_there_and_asked_for(name: str) -> None:
     assert probes or NOTES[name].startswith("No probe: ")
     for file, test in probes:
         assert f"def {test or 'test_'}" in (ROOT / file).read_text(encoding="utf-8")
+
+
+def test_the_page_counts_the_attempts() -> None:
+    assert f"| {len(ATTEMPTS)} attempts, by each kind of child |" in PAGE
 
 
 def test_what_was_tried_is_kept_somewhere() -> None:
