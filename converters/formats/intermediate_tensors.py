@@ -15,6 +15,7 @@ import numpy as np
 from msgspec import Struct
 
 from converters.graph.nodes import split_ref
+from converters.graph.ops.samplers import KINDS
 
 if TYPE_CHECKING:
     from converters.runtimes.pool import RuntimePool
@@ -23,6 +24,9 @@ if not TYPE_CHECKING:  # what asks a record for its signature looks these names 
 
 Feeds = Mapping[str, np.ndarray]
 Run = Callable[[Feeds, Sequence[str]], dict[str, np.ndarray]]
+RunAll = Callable[[Sequence[Feeds], Sequence[str]], list[dict[str, np.ndarray]]]
+#: The outputs of samplers that are fed, with their ranks, and the tensors that are fetched → what runs it so.
+Opened = Callable[[Mapping[str, int], Sequence[str]], contextlib.AbstractContextManager[RunAll]]
 
 
 class View(Struct, frozen=True):
@@ -38,13 +42,33 @@ class View(Struct, frozen=True):
         return array.transpose(np.argsort(self.axes))
 
 
+class Sampler(Struct, frozen=True):
+    """An op of an artefact that draws, by the artefact's names: its output, the scores of the classes that it draws.
+
+    ``kind`` is a kind of the op table; numbers are ``scale`` times those of the kind, and ``mean`` more. ``dtype`` is
+    that of the output, where it may be another than the policy's.
+    """
+
+    tensor: str
+    kind: str
+    scores: str | None = None
+    mean: float = 0.0
+    scale: float = 1.0
+    dtype: str | None = None
+
+
 class InnerTensors(Struct, frozen=True):
-    """``view`` says how the format has a tensor of the graph (None: not at all), ``run`` fetches what it calls so."""
+    """``view`` says how the format has a tensor of the graph (None: not at all), ``run`` fetches what it calls so.
+
+    ``opened`` runs the artefact with the outputs of ``samplers`` as inputs; None where it cannot be run so.
+    """
 
     view: Callable[[str], View | None]
     run: Run
     #: Another tool may have made it: what has a tensor's name may be another tensor.
     foreign: bool = False
+    samplers: Sequence[Sampler] = ()
+    opened: Opened | None = None
 
     def fetch(self, feeds: Feeds, tensors: Sequence[str]) -> dict[str, np.ndarray]:
         """Tensors of the graph by name, its own axes; raises RunFailedError."""
@@ -59,8 +83,13 @@ class Loaded(Struct, frozen=True):
     path: Path
     runtime: str
     run: Run
+    run_all: RunAll
     pool: RuntimePool
     signature: str = ""
+
+    def open_any(self, fed: Mapping[str, int], fetched: Sequence[str]) -> contextlib.AbstractContextManager[RunAll]:
+        """Run it as it is: its runtime feeds and fetches any tensor."""
+        return contextlib.nullcontext(self.run_all)
 
 
 def no_tensors(loaded: Loaded) -> contextlib.AbstractContextManager[InnerTensors]:
@@ -72,3 +101,12 @@ def own_names(nodes: Iterable[str]) -> Callable[[str], View | None]:
     """A view for a format that has ``nodes``, called as in the graph."""
     known = frozenset(nodes)
     return lambda tensor: View(tensor) if split_ref(tensor)[0] in known else None
+
+
+def samplers_of(nodes: Mapping[str, tuple[str, Sequence[str]]], classes: str | None = None) -> tuple[Sampler, ...]:
+    """The samplers among a graph's nodes: name → (op, what it reads). ``classes`` is the dtype of drawn classes."""
+    return tuple(
+        Sampler(name, KINDS[op], inputs[0], dtype=classes) if KINDS[op] == "categorical" else Sampler(name, KINDS[op])
+        for name, (op, inputs) in nodes.items()
+        if op in KINDS
+    )

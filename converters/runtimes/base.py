@@ -54,6 +54,8 @@ class Runtime(Struct, frozen=True):
     arithmetic: Arithmetic = "processor"
     #: All sessions of a process begin to draw alike, whatever their models.
     sessions_alike: bool = False
+    #: What is wrong with how it draws, whatever an artefact says: only what is made of its draws is compared.
+    poor_draws: str = ""
     #: Multiplications that a policy's products take a second on one core, about (measured).
     products_per_second: float = 1e9
     #: The word that takes it: ``auto`` where it is installed, ``full``, or its own name alone.

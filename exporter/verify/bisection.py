@@ -26,7 +26,6 @@ from converters.graph.ops.table import traits
 from converters.graph.run import run_graph
 from converters.runtimes.pool import RuntimePool
 from exporter.verify.difference import Difference, compare
-from exporter.verify.drawn_columns import drawn_columns
 from exporter.verify.findings import Bisection
 from exporter.verify.inner_tensors import inner_tensors, outputs_read
 from exporter.verify.participants import Feeds, Participant, PolicyUnderTest
@@ -58,7 +57,8 @@ class Bisector:
         self._agrees, self._rounding = agrees, rounding
         self._opened: tuple[tuple[str, str], InnerTensors] | None = None
         self._stack = contextlib.ExitStack()
-        self._compared: set[Path] = set()
+        #: artefacts whose constants were compared
+        self.compared: set[Path] = set()
 
     def close(self) -> None:
         """Free what was loaded to look inside."""
@@ -86,9 +86,9 @@ class Bisector:
         Weights that were rounded change outputs by less than any tolerance where these hardly vary. A format is looked
         at in the first runtime that runs it.
         """
-        if participant.path is None or participant.fed is not None or participant.path in self._compared:
+        if participant.path is None or participant.fed is not None or participant.path in self.compared:
             return []
-        self._compared.add(participant.path)
+        self.compared.add(participant.path)
         if not self._differing(self._runnable, participant, feeds):
             return []
         graph = self.graph  # a bundle's graph is that of its .bytes, which may be what is wrong
@@ -187,9 +187,7 @@ class _Search(Struct, frozen=True, eq=False):
             for tensor in chunk:
                 if tensor in got and (found := self._wrong(tensor, expected[tensor], got[tensor], seen)) is not None:
                     return found
-        if samplers and not drawn_columns(
-            self.graph, [output]
-        ):  # one for each branch, in their order; a joint one for all
+        if samplers:  # one for each branch, in their order; a joint one for all
             sampler = samplers[min(branch, len(samplers) - 1)]
             reason = "what it draws from agrees, what it draws does not"
             return Bisection(sampler.name, sampler.op, self.source(sampler), reason=reason)

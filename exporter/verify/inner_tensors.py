@@ -6,6 +6,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from msgspec.structs import replace
+
 from converters.formats.intermediate_tensors import InnerTensors, Loaded, View, no_tensors
 from converters.formats.registry import FROZEN_GRAPH, WRITTEN
 from converters.graph.nodes import ref, split_ref
@@ -22,7 +24,8 @@ def inner_tensors(
     What any tool may have made is fed by its own names, and its tensors may be called as the source's (``origins``).
     """
     key, _, signature = participant.format.partition(":")
-    loaded = Loaded(path, participant.runtime, participant.model.run, pool, signature)
+    model = participant.model
+    loaded = Loaded(path, participant.runtime, model.run, model.run_all, pool, signature)
     form = WRITTEN.get(key, FROZEN_GRAPH)  # the reference and the original are frozen graphs
     with (form.inner or no_tensors)(loaded) as found:
         if participant.fed is None:
@@ -35,7 +38,7 @@ def inner_tensors(
             names = (tensor, source, source.removesuffix(":0"), f"{source.removesuffix(':0')}:0")
             return next((v for name in names if (v := view(name)) is not None), None)
 
-        yield InnerTensors(find_view, lambda feeds, fetch: run(own(feeds), fetch), foreign=True)
+        yield replace(found, view=find_view, run=lambda feeds, fetch: run(own(feeds), fetch), foreign=True)
 
 
 def outputs_read(nodes: Sequence[str], reads: Sequence[str]) -> dict[str, list[str]]:

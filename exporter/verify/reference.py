@@ -16,7 +16,6 @@ from converters.graph.nodes import Graph
 from converters.graph.ops.samplers import SAMPLERS
 from converters.runtimes.pool import RuntimePool
 from exporter.verify.baked import apply_stated
-from exporter.verify.drawn_columns import drawn_columns
 from exporter.verify.findings import Undecided, undecided_reference
 from exporter.verify.original import Original
 from exporter.verify.participants import Participant, PolicyUnderTest
@@ -37,10 +36,7 @@ class Reference(AbstractContextManager["Reference"]):
         self.model: LoadedModel = pool.process("numpy").load(str(tested.reference), seed=seed, format=form)
         self.original: Original | None = None
         #: outputs that a sampler in the graph decides
-        found = random_outputs(tested.graph, [s.name for s in self.signature.outputs])
-        #: outputs of which it decides some columns, and which: the others are numbers
-        self.partly_drawn = drawn_columns(tested.graph, found)
-        self.drawn = found - self.partly_drawn.keys()
+        self.drawn = random_outputs(tested.graph, [s.name for s in self.signature.outputs])
         #: what the source's own runtime refused
         self.failures: list[Undecided] = []
         self.name = "numpy"

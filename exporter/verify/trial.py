@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from contextlib import ExitStack
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
+from converters.files.folders import scratch_folder
 from converters.formats.bundle.embed import runnable
 from converters.formats.registry import narrows
 from converters.graph.nodes import Graph
@@ -17,6 +19,7 @@ from converters.graph.run import run_graph
 from converters.runtimes.pool import RuntimePool
 from exporter.verify.bisection import Bisector
 from exporter.verify.choices import Choices, broken_ties
+from exporter.verify.cut import CutPolicy, cut_policy
 from exporter.verify.difference import (
     ONE_SIDED,
     OPEN,
@@ -30,7 +33,6 @@ from exporter.verify.difference import (
     score_bounds,
     spread,
 )
-from exporter.verify.drawn_columns import without_draws
 from exporter.verify.excuses import (
     CHAOS,
     NAN_FROM_ZERO,
@@ -79,6 +81,13 @@ class Question(Struct, frozen=True):
     found: Difference
 
 
+class Cut(Struct, frozen=True, eq=False):
+    """A policy with its samplers as inputs, and its trial."""
+
+    policy: CutPolicy
+    trial: Trial
+
+
 class Trial:
     """One policy that is tried. Raises UsageError where a recording does not fit it."""
 
@@ -102,8 +111,37 @@ class Trial:
         self._first: dict[str, str] = {}
         #: files that were started twice, to see whether they draw alike
         self.started: set[Path] = set()
+        #: what is to be known of a runtime, for the report
+        self.remarks: dict[str, None] = {}
         self.expected: list[Arrays] = []
         self.expected_steps: list[Arrays] = []
+        self._stack = ExitStack()
+
+    @cached_property
+    def cut(self) -> Cut | None:
+        """The policy with its samplers as inputs, tried on as many inputs; None where it cannot be cut.
+
+        Raises RunFailedError.
+        """
+        policy = cut_policy(self.tested, Path(self._stack.enter_context(scratch_folder())))
+        if policy is None:
+            return None
+        if policy.tested is self.tested:  # its noise is an input as it is
+            return Cut(policy, self)
+        trial = Trial(policy.tested, self.pool, replace(self.options, golden=None))
+        source = policy.tested.source
+        given = [source.runtime] if source is not None and self.reference.original is not None else []
+        reference = self._stack.enter_context(Reference(policy.tested, given, self.pool, self.options.seed))
+        steps = [dict(feeds) for feeds in trial.steps]
+        trial.steps = [*steps]
+        policy.draw([*(case.feeds for case in trial.cases), *steps], reference.model, self.options.seed)
+        trial.ask(reference)
+        trial.bisector.compared = self.bisector.compared
+        return Cut(policy, trial)
+
+    def close(self) -> None:
+        """Free what was loaded to answer for the policy without its samplers, and to look inside."""
+        self._stack.close()
 
     def replace_inputs(self, inputs: Inputs) -> None:
         """Ask these in place of what was drawn."""
@@ -116,8 +154,7 @@ class Trial:
         reference.remember(inputs)
         self.expected = reference.answers(inputs)
         self._apart = reference.apart()
-        drawn = {*reference.drawn, *reference.partly_drawn}
-        if self.signature.memory is not None and self.signature.memory.output in drawn:
+        if self.signature.memory is not None and self.signature.memory.output in reference.drawn:
             self.steps = []  # it keeps what was drawn: every run goes another way
         self.expected_steps = self.roll_out(lambda feeds: reference.answers([feeds])[0])
         numbers = [s.name for s in self.signature.outputs if s.name not in reference.drawn and s.dtype == "float32"]
@@ -144,7 +181,7 @@ class Trial:
             f"which integers {name} takes is not known: 0 and 1 were tried, and no others"
             for name in unknown_ids(self.signature)
         ]
-        return [*unknown, *self._left_out()]
+        return [*unknown, *self._left_out(), *self.remarks]
 
     def _left_out(self) -> list[str]:
         return [note for (who, _), each in self._allowances.items() if (note := each.note(who)) is not None]
@@ -403,13 +440,10 @@ class Trial:
         return True
 
     def _comparable(self, values: Feeds) -> Arrays:
-        """Values as they are compared: log-probabilities that say "never" are all the same, drawn columns are zeros."""
-        partly = self.reference.partly_drawn
+        """Values as they are compared: log-probabilities that say "never" are all the same."""
         return {
             n: floor_log_probs(a, self.signature.branches)
             if n in self._scores and a.dtype.kind == "f" and a.ndim
-            else without_draws(a, partly[n])
-            if n in partly
             else a
             for n, a in values.items()
         }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from contextlib import closing
 
 from msgspec.structs import replace
 
@@ -11,7 +12,6 @@ from converters.runtimes.pool import INDEPENDENT
 from exporter.verify.checks.agents import agents
 from exporter.verify.checks.baked import check_baked
 from exporter.verify.checks.consumer import consumers
-from exporter.verify.checks.densities import densities
 from exporter.verify.checks.draws import draws
 from exporter.verify.checks.finite import check_defined
 from exporter.verify.checks.numbers import check_recording, numbers
@@ -39,7 +39,7 @@ Participants = Callable[[LoadedModel, Failure], Iterable[Participant]]
 Judge = Callable[[PolicyUnderTest, Session, Participants | None], ParityReport]
 Check = Callable[[Trial, Participant], Iterator[Finding]]
 #: What each participant is put through, one after the other.
-CHECKS: tuple[Check, ...] = (numbers, rollout, draws, densities, agents)
+CHECKS: tuple[Check, ...] = (numbers, rollout, draws, agents)
 
 
 def verify(
@@ -61,7 +61,7 @@ def verify(
     if session.runtimes:
         session.progress(f"{tested.name}: starting the runtimes, running the source")
         session.pool.start(needed_runtimes(tested, session.runtimes))
-        with Reference(tested, session.runtimes, session.pool, session.options.seed) as answering:
+        with Reference(tested, session.runtimes, session.pool, session.options.seed) as answering, closing(trial):
             reference = answering.name
             findings += _findings(trial, answering, session, participants, inputs, checks)
         notes = trial.notes()

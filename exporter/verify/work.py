@@ -34,6 +34,14 @@ class Allowance:
         self.left -= rows
         return True
 
+    def at_most(self, rows: int, what: str) -> int:
+        """How many of this many there is time for; they are taken, and what is left out of ``what`` is noted."""
+        taken = min(rows, self.left)
+        if taken < rows:
+            self.left_out.append(f"{what} but for {taken}")
+        self.left -= taken
+        return taken
+
     def note(self, who: str) -> str | None:
         """What was left out, for a report."""
         if not self.left_out:

@@ -315,13 +315,13 @@ def test_a_batch_that_is_frozen_is_fed_in_its_size_and_another_width_is_a_failur
     assert "has the shape [?, 99], the reference's [?, 8]" in failure.reason
 
 
-def test_noise_that_the_candidate_draws_itself_is_not_compared_by_numbers(
+def test_classes_that_the_candidate_draws_itself_are_compared_by_numbers_and_distribution(
     bundles: Bundles, tmp_path: Path, pool: RuntimePool
 ) -> None:
     (kept,) = export([fixture("sampled")], ExportOptions(tmp_path, verify="none", name="kept"))
     report = compare_artefacts(fixture("sampled"), [kept.folder], runtimes=RUNTIMES, pool=pool)
     assert report.passed is True
-    assert {c.kind for c in report.comparisons if c.output == "action"} == {"shape", "draws"}
+    assert {c.kind for c in report.comparisons if c.output == "action"} == {"shape", "numbers", "draws"}
 
 
 def drawing(spread: float | None) -> Callable[[onnx.ModelProto], None]:

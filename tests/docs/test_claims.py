@@ -8,6 +8,7 @@ import tomllib
 from pathlib import Path
 
 import click
+import numpy as np
 import pytest
 
 from converters.consumers.profiles import PROFILES, profile
@@ -15,8 +16,8 @@ from converters.formats.registry import WRITTEN
 from exporter.cli.app import app
 from exporter.demo import BALL
 from exporter.snippets.registry import TARGETS
-from exporter.verify import rounding, statistics
-from exporter.verify.checks import decisions, draws
+from exporter.verify import cut, rounding, statistics
+from exporter.verify.checks import decisions, densities, mixed
 from exporter.verify.difference import SHARE, SIZE
 from exporter.verify.options import VerifyOptions
 from exporter.verify.tolerances import ATOL, RTOL, Tolerance, tolerance_for
@@ -85,8 +86,10 @@ def test_the_figures_of_agreement_are_those_of_the_program() -> None:
     for claim in (
         f"at most {words[rounding.FACTOR]} times the largest movement",
         f"{words[rounding.RUNS]} runs, and {words[rounding.MORE_RUNS]} more",
-        f"false alarm rate of {statistics.FALSE_ALARM:.0e}".replace("e-06", "e-6"),
-        f"drawn {draws.DRAWS} times",
+        "calls a right sampler wrong once in 10⁶ times",
+        f"at {mixed.DRAWS} rows of many inputs in one batch ({mixed.FEW} with",
+        f"classes against the reference's log-probabilities, {mixed.DRAWS} draws",
+        "down to one in 10⁹",
         f"and {LARGE_BATCH} (1 to 7",
         f"no more than {MOST_IDS} ",
         f"about {SECONDS} seconds of inputs",
@@ -96,6 +99,8 @@ def test_the_figures_of_agreement_are_those_of_the_program() -> None:
     ):
         assert claim in text, claim
     assert (SHARE, SIZE) == (1e-3, 2.0**-17)
+    assert (1e-6, float(np.log(1e-9))) == (statistics.FALSE_ALARM, cut.NEVER)
+    assert densities.DENSITY_DRAWS == densities.KINDS * 512
     formats = prose(ROOT / "docs" / "formats.md")
     assert decisions.LIMITS == {"float16": 0.01, "int8": 0.05}
     assert "at most 1% (float16) or 5% (int8) of the choices" in formats

@@ -21,6 +21,7 @@ from converters.runtimes import pool as runtimes
 from converters.runtimes.registry import RuntimeInfo
 from exporter.export import pipeline
 from exporter.export.pipeline import ExportResult
+from exporter.verify.cut import CUT
 from exporter.verify.report import ParityReport
 
 Array = npt.NDArray[Any]
@@ -98,13 +99,15 @@ class ActingProcess:
             raise RunFailedError(f"{self.name} is not running")
 
     def load(self, path: str, **options: Any) -> Actor:
+        self.pool.loaded += 1
         place = Path(path)
         kind = "bytes" if self.name == "numpy" else format_of(place)
         if (kind, self.name) in self.pool.refused:
+            self.pool.loaded -= 1
             raise RunFailedError(f"{self.name} failed", why="it does not like this model")
         if kind == "source" or place.suffix == ".bytes":
             graph = graph_in(place)
-            if self.name == "numpy":
+            if self.name == "numpy" and place.name != CUT:
                 self.pool.reference = graph
         else:
             assert self.pool.reference is not None, "numpy is always the first to load"
@@ -121,6 +124,7 @@ class ActingPool:
     unloaded: list[tuple[str, str]] = field(default_factory=list)
     processes: dict[str, ActingProcess] = field(default_factory=dict)
     reference: Graph | None = None
+    loaded: int = 0
 
     def start(self, names: Iterable[str]) -> None:
         pass

@@ -14,6 +14,7 @@ import pytest
 from converters.files import tensorflow_messages as schema
 from converters.files.children.process import LoadedModel
 from converters.formats.frozen_graph.tensors import from_array, to_array
+from converters.formats.intermediate_tensors import Sampler
 from converters.formats.registry import DEFAULTS
 from converters.runtimes.pool import RuntimePool
 from converters.runtimes.registry import RuntimeInfo
@@ -21,12 +22,13 @@ from exporter.export.again import verify_folder
 from exporter.export.pipeline import ExportOptions, export
 from exporter.verify import work
 from exporter.verify.checks.densities import _joint
-from exporter.verify.checks.draws import least_likely, repeats, with_zeros
+from exporter.verify.checks.generators import seen_by, with_zeros, wrong_draws
+from exporter.verify.difference import Difference
 from exporter.verify.options import VerifyOptions
 from exporter.verify.participants import Feeds, Participant, policy_under_test
 from exporter.verify.report import ParityReport
 from exporter.verify.session import Session
-from exporter.verify.statistics import FALSE_ALARM
+from exporter.verify.statistics import ranks
 from exporter.verify.tolerances import Tolerance
 from exporter.verify.verification import verify
 from fixtures import path as fixture
@@ -208,47 +210,79 @@ def log_softmax(logits: npt.NDArray[Any]) -> npt.NDArray[Any]:
     return np.asarray(logits - np.log(np.exp(logits).sum(axis=1, keepdims=True)))
 
 
-def drawn(rng: np.random.Generator, log_probs: npt.NDArray[Any], count: int = 512) -> npt.NDArray[Any]:
-    return np.stack([rng.choice(len(row), count, p=np.exp(row) / np.exp(row).sum()) for row in log_probs])
+def drawn(rng: np.random.Generator, log_probs: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """A class for each row of log-probabilities [rows, classes]."""
+    above = np.cumsum(np.exp(log_probs) / np.exp(log_probs).sum(axis=1, keepdims=True), axis=1)
+    return (rng.random((len(log_probs), 1)) >= above).sum(axis=1)
+
+
+def judged(
+    branches: Sequence[npt.NDArray[Any]], log_probs: Sequence[npt.NDArray[Any]], runtime: str = "onnxruntime"
+) -> list[Difference]:
+    """What is said of classes [rows] of each branch, drawn from log-probabilities [rows, classes]."""
+    who = Participant(format="onnx", runtime=runtime, run=lambda *_: [], outputs=(), model=None)  # type: ignore[arg-type]
+    samplers = [Sampler(str(number), "categorical") for number in range(len(branches))]
+    classes = {s.tensor: branch[:, None] for s, branch in zip(samplers, branches, strict=True)}
+    odds = {s.tensor: seen_by(who, part) for s, part in zip(samplers, log_probs, strict=True)}
+    return list(wrong_draws(samplers, classes, odds, who).values())
+
+
+def in_turn(rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    return np.tile(rows, (4096 // len(rows), 1))
 
 
 def test_a_right_sampler_is_called_right() -> None:
-    """The p-value is uniform or larger, so of 200 hardly one is below 1/1000."""
     rng = np.random.default_rng(0)
-    lowest = []
-    for _ in range(200):
-        parts = [log_softmax(rng.standard_normal((12, size)) * rng.uniform(0, 6)) for size in (3, 4)]
-        classes = np.stack([drawn(rng, part, 64) for part in parts], axis=2)
-        lowest.append(least_likely(classes, np.concatenate(parts, axis=1), (3, 4))[0])
-    assert sum(p < 1e-3 for p in lowest) <= 3
-    assert min(lowest) > 1e-5
+    for _ in range(100):
+        parts = [in_turn(log_softmax(rng.standard_normal((12, size)) * rng.uniform(0, 6))) for size in (3, 4)]
+        found = judged([drawn(rng, part) for part in parts], parts)
+        assert all(d.passed and d.max_abs < 1 - 1e-5 for d in found), found
 
 
 def test_a_temperature_is_seen() -> None:
     rng = np.random.default_rng(1)
-    log_probs = log_softmax(rng.standard_normal((12, 4)))
-    classes = drawn(rng, log_softmax(log_probs / 0.8))
-    assert least_likely(classes[:, :, None], log_probs, (4,))[0] < 1e-6
+    log_probs = in_turn(log_softmax(rng.standard_normal((12, 4))))
+    assert not judged([drawn(rng, log_softmax(log_probs / 0.8))], [log_probs])[0].passed
 
 
 def test_a_rare_class_that_is_never_drawn_is_seen() -> None:
     rng = np.random.default_rng(2)
-    log_probs = log_softmax(np.concatenate([rng.standard_normal((12, 3)) / 2, np.full((12, 1), -3.5)], axis=1))
+    log_probs = np.concatenate([rng.standard_normal((12, 3)) / 2, np.full((12, 1), -3.5)], axis=1)
+    log_probs = in_turn(log_softmax(log_probs))
     classes = drawn(rng, log_probs)
-    assert least_likely(classes[:, :, None], log_probs, (4,))[0] > 1e-6
+    assert judged([classes], [log_probs])[0].passed
     classes[classes == 3] = 0
-    assert least_likely(classes[:, :, None], log_probs, (4,))[0] < 1e-6
+    assert not judged([classes], [log_probs])[0].passed
 
 
 def test_branches_that_are_drawn_from_one_seed_are_seen() -> None:
     rng = np.random.default_rng(3)
-    log_probs = log_softmax(rng.standard_normal((12, 3)))
+    log_probs = in_turn(log_softmax(rng.standard_normal((12, 3))))
     once, again = drawn(rng, log_probs), drawn(rng, log_probs)
-    both = np.concatenate([log_probs, log_probs], axis=1)
-    assert least_likely(np.stack([once, again], axis=2), both, (3, 3))[0] > 1e-6
-    p_value, branch, _ = least_likely(np.stack([once, once], axis=2), both, (3, 3))
-    assert p_value < 1e-6
-    assert branch == 1
+    assert all(d.passed for d in judged([once, again], [log_probs] * 2))
+    assert "serves several" in judged([once, once], [log_probs] * 2)[0].reason
+
+
+@pytest.mark.parametrize("plant", ["pairs", "halves"])
+def test_rows_of_one_kind_that_hang_on_each_other_are_seen(plant: str) -> None:
+    rng = np.random.default_rng(4)
+    log_probs = np.tile(log_softmax(rng.standard_normal((1, 5))), (4096, 1))
+    classes = drawn(rng, log_probs)
+    spoiled = np.repeat(classes[::2], 2) if plant == "pairs" else np.resize(classes[:2048], 4096)
+    assert "not independent" in judged([spoiled], [log_probs])[0].reason
+
+
+@pytest.mark.parametrize("kind", ["normal", "uniform", "truncated normal"])
+def test_numbers_of_a_sampler_are_seen_to_be_others(kind: str) -> None:
+    who = Participant(format="onnx", runtime="c", run=lambda *_: [], outputs=(), model=None)  # type: ignore[arg-type]
+    rng = np.random.default_rng(5)
+    right = rng.random((4096, 3)) if kind == "uniform" else rng.standard_normal((4096, 3))
+    while kind == "truncated normal" and (outside := np.abs(right) > 2).any():
+        right[outside] = rng.standard_normal(int(outside.sum()))
+    for made, passes in ((right, True), (right * 1.15, False), (right + 0.1, False), (right.round(), False)):
+        assert wrong_draws([Sampler("x", kind)], {"x": made}, {}, who)["x"].passed is passes
+        scaled = Sampler("x", kind, mean=3, scale=2)
+        assert wrong_draws([scaled], {"x": made * 2 + 3}, {}, who)["x"].passed is passes
 
 
 #: Classes [rows, branches] → those that a sampler gives that does not draw each row by itself.
@@ -265,16 +299,16 @@ def test_draws_that_hang_on_each_other_are_met(kind: str, tmp_path: Path, proces
         return {n: DEPENDENT[kind](a) if n == "action" else a for n, a in answers.items()}
 
     report = verified("sampled", tmp_path, processes, spoil)
-    assert [f.output for f in report.failures] == ["action"]
-    assert "not independent" in report.failures[0].reason
+    assert [f.output for f in report.failures] == ["action"]  # rows take turns: one has the draws of another's odds
+    assert report.failures[0].kind == "draws"
 
 
 def test_numbers_that_hang_on_each_other_are_seen() -> None:
     rng = np.random.default_rng(4)
     right, other = rng.standard_normal((2, 4096, 3)).clip(-1, 2)
-    assert _joint(right, other) is None
+    assert _joint(ranks(right), ranks(other)) is None
     for spoiled in (np.repeat(other[::2], 2, axis=0), np.resize(other[:2048], other.shape), other[:, [0, 0, 2]]):
-        assert _joint(right, spoiled) is not None
+        assert _joint(ranks(right), ranks(spoiled)) is not None
 
 
 @pytest.mark.parametrize("middles", [(0.2, 6.25), (5.0,), (6.3,), (0.2, 6.3, 6.5, -6.3)])
@@ -283,23 +317,23 @@ def test_saturated_numbers_hang_together_by_chance(middles: Sequence[float]) -> 
     for seed in range(12):
         rng = np.random.default_rng(seed)
         one, other = ((np.array(middles) + rng.standard_normal((4096, len(middles)))).clip(-3, 3) / 3 for _ in range(2))
-        assert _joint(one, other) is None, seed
+        assert _joint(ranks(one), ranks(other)) is None, seed
     bound = np.ones((4096, 2))
-    assert _joint(bound, np.nextafter(bound, 0)) is None
+    assert _joint(ranks(bound), ranks(np.nextafter(bound, 0))) is None
 
 
 def test_numbers_that_honestly_share_their_noise_are_independent_draws() -> None:
     for seed in range(12):
         one, other = (np.random.default_rng([seed, k]).standard_normal((512, 1)).repeat(8, axis=1) for k in (1, 2))
-        assert _joint(one, other) is None, seed
+        assert _joint(ranks(one), ranks(other)) is None, seed
 
 
 def test_thousands_of_classes_are_told_from_those_that_were_drawn() -> None:
     rng = np.random.default_rng(5)
-    log_probs = log_softmax(rng.standard_normal((2, 20_000)))
-    classes = drawn(rng, log_probs)[:, :, None]
-    assert repeats(classes, log_probs, (20_000,)) == 0
-    assert repeats(np.repeat(classes[:, ::2], 2, axis=1), log_probs, (20_000,)) == 1
+    log_probs = np.tile(log_softmax(rng.standard_normal((1, 20_000))), (512, 1))
+    classes = drawn(rng, log_probs)
+    assert judged([classes], [log_probs])[0].passed
+    assert "rows 1 apart" in judged([np.repeat(classes[::2], 2)], [log_probs])[0].reason
 
 
 @pytest.mark.parametrize("action", [1, 4, 8])
@@ -384,13 +418,11 @@ def test_weights_that_were_rounded_are_met_where_outputs_hardly_vary(
 def test_a_sampler_whose_uniform_number_is_sometimes_zero_is_expected_to_draw_the_first_class() -> None:
     """TensorFlow.js' WebGL shader; what has no probability at all stays without."""
     with np.errstate(divide="ignore"):
-        log_probs = np.log(np.array([[0.0, 1e-10, 1 - 1e-10, 0.25, 0.75]]))
-    probs = np.exp(with_zeros(log_probs, [3, 2], 2.0**-12))[0]
-    np.testing.assert_allclose(probs[:3], [0, 1e-10 + 2.0**-12, 1 - 2.0**-12], rtol=1e-6)
-    np.testing.assert_allclose(probs[3:].sum(), 1)
-    generator = np.random.default_rng(0)
-    rare = np.where(generator.random((1, 512, 1)) < 2.0**-12, 0, 1)
-    ordinary = np.log(np.array([[1e-10, 1 - 1e-10]]))
-    rare[0, 0] = 0
-    assert least_likely(rare, ordinary, [2])[0] < FALSE_ALARM
-    assert least_likely(rare, with_zeros(ordinary, [2], 2.0**-12), [2])[0] >= FALSE_ALARM
+        log_probs = np.log(np.array([[0.0, 1e-10, 1 - 1e-10]]))
+    probs = np.exp(with_zeros(log_probs, 2.0**-12))[0]
+    np.testing.assert_allclose(probs, [0, 1e-10 + 2.0**-12, 1 - 2.0**-12], rtol=1e-6)
+    rare = np.where(np.random.default_rng(0).random(4096) < 2.0**-12, 0, 1)
+    rare[0] = 0
+    ordinary = np.log(np.tile([[1e-10, 1 - 1e-10]], (4096, 1)))
+    assert not judged([rare], [ordinary])[0].passed
+    assert judged([rare], [ordinary], "tfjs-webgl")[0].passed

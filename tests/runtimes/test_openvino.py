@@ -37,10 +37,12 @@ def test_fixtures_agree(name: str, tmp_path: Path, here: RuntimePool) -> None:
     assert "openvino" in {c.runtime for c in result.report.comparisons}
 
 
-def test_that_its_draws_are_always_the_same_is_found(tmp_path: Path, here: RuntimePool) -> None:
+def test_that_its_own_draws_are_a_note_and_what_is_made_of_them_a_number(tmp_path: Path, here: RuntimePool) -> None:
     """OpenVINO 2026.4 gives Multinomial the same numbers in every call; a session that begins anew does not help."""
     (result,) = export([path("sampled")], ExportOptions(tmp_path, ("onnx",), verify=("openvino",)), pool=here)
     assert result.report is not None
-    assert result.report.passed is False
-    failed = {(f.output, f.kind) for f in result.report.failures}
-    assert failed == {("action", "draws")}
+    assert result.report.passed is True
+    own = {(c.output, c.kind) for c in result.report.comparisons if c.runtime == "openvino"}
+    assert ("action", "numbers") in own
+    assert ("action", "draws") not in own
+    assert any("the same classes in every call" in note for note in result.report.notes)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +9,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from converters.graph.nodes import Graph
 from converters.policy.policy import Policy
 from exporter.verify.checks.numbers import numbers
 from exporter.verify.choices import Choices, broken_ties
-from exporter.verify.drawn_columns import drawn_columns, without_draws
 from exporter.verify.tolerances import Tolerance
 from tests.handmade import constant, node, placeholder
 from tests.verify.judged import Feeds, compiled, judge, spoiling, wrong
@@ -76,37 +73,3 @@ def test_choices_stand_behind_what_hangs_on_them() -> None:
     nothing = {"state": np.full((2, 3), np.nan, np.float32)}
     assert Choices(graph).has_only_nan_scores("action", nothing)
     assert not Choices(graph).has_only_nan_scores("action", {"state": np.ones((2, 3), np.float32)})
-
-
-def _drawn(*more: Any) -> Graph:
-    """A draw of one class beside two numbers that are computed."""
-    return compiled(
-        [
-            placeholder("vector_observation"),
-            constant("w", np.ones((3, 2), np.float32)),
-            node("known", "MatMul", "vector_observation", "w", transpose_a=False, transpose_b=False, **F),
-            constant("one", 1),
-            node("draw", "Multinomial", "known", "one", output_dtype=np.int64, T=np.float32, seed=0, seed2=0),
-            node("action", "Identity", "draw", T=np.int64),
-            *more,
-        ]
-    ).graph
-
-
-def _columns(graph: Graph, names: Sequence[str]) -> dict[str, list[bool]]:
-    return {name: mask.tolist() for name, mask in drawn_columns(graph, names).items()}
-
-
-def test_columns_that_a_sampler_decides_are_told_from_the_others() -> None:
-    cast = node("number", "Cast", "draw", SrcT=np.int64, DstT=np.float32)
-    axis = [constant("last", 1, np.int32), constant("first", 0, np.int32)]
-    both = node("value_estimate", "ConcatV2", "known", "number", "last", N=2, T=np.float32, Tidx=np.int32)
-    graph = _drawn(cast, *axis, both)
-    assert _columns(graph, ["value_estimate", "action"]) == {"value_estimate": [False, False, True]}
-    assert _columns(graph, ["action"]) == {}
-
-
-def test_drawn_columns_are_left_out_of_numbers() -> None:
-    values, mask = np.array([[1, 2, 3], [4, 5, np.nan]], np.float32), np.array([False, False, True])
-    assert np.array_equal(without_draws(values, mask), [[1, 2, 0], [4, 5, np.nan]], equal_nan=True)
-    assert without_draws(values, mask[:2]) is values

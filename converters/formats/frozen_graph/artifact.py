@@ -19,7 +19,7 @@ from converters.files.memory_mapped import Mapped
 from converters.formats.format import Port, Ports
 from converters.formats.frozen_graph.reader import from_graph_def, read_graph
 from converters.formats.frozen_graph.subgraph import subgraph
-from converters.formats.intermediate_tensors import Feeds, InnerTensors, Loaded, own_names
+from converters.formats.intermediate_tensors import Feeds, InnerTensors, Loaded, own_names, samplers_of
 from converters.graph.nodes import Graph, node_of
 from converters.graph.ops.table import is_fed
 
@@ -47,7 +47,9 @@ def inner(loaded: Loaded) -> AbstractContextManager[InnerTensors]:
         values = {name: feeds[name] for name in fetch if name in feeds}
         return {**values, **loaded.run(feeds, others)} if others else values
 
-    return contextlib.nullcontext(InnerTensors(own_names(n.name for n in message.node), run))
+    samplers = samplers_of({n.name: (n.op, n.input) for n in message.node})
+    view = own_names(n.name for n in message.node)
+    return contextlib.nullcontext(InnerTensors(view, run, samplers=samplers, opened=loaded.open_any))
 
 
 def safe_copy(path: Path, wanted: Sequence[str], folder: Path) -> Path:

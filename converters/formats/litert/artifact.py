@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+import itertools
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import numpy as np
 from converters.files.fetch import read_bytes
 from converters.files.folders import scratch_folder
 from converters.formats.format import Port, Ports
-from converters.formats.intermediate_tensors import Feeds, InnerTensors, Loaded, View
+from converters.formats.intermediate_tensors import Feeds, InnerTensors, Loaded, RunAll, Sampler, View
 from converters.formats.litert.flatbuffer import Table, decode, encode
 from converters.formats.litert.schema import BUILTINS, OPERATOR_NAMES
 from converters.formats.litert.tensors import dims_of, dtype_of, entry_of, needed_operators
@@ -96,6 +97,10 @@ def function_alone(path: Path, function: int, ports: Collection[int]) -> bytes:
     return encode({**{k: v for k, v in model.items() if k in kept}, "subgraphs": [alone]}).to_bytes()
 
 
+#: Operators that draw.
+_DRAWS = {"RANDOM_STANDARD_NORMAL": "normal", "RANDOM_UNIFORM": "uniform", "MULTINOMIAL": "categorical"}
+
+
 @contextmanager
 def inner(loaded: Loaded) -> Iterator[InnerTensors]:
     """Those of a signature, in the same runtime: a copy gives them as further outputs."""
@@ -115,29 +120,55 @@ def inner(loaded: Loaded) -> Iterator[InnerTensors]:
         found = names.view(tensor)
         return found if found is not None and found.name in numbers else None
 
+    samplers, turns = _samplers(model, subgraph), itertools.count()
+
+    @contextmanager
+    def opened(draws: Mapping[str, int], fetch: Sequence[str]) -> Iterator[RunAll]:
+        drawn = {numbers[name] for name in draws}
+        wider = {
+            **subgraph,
+            "inputs": [*subgraph["inputs"], *sorted(drawn)],
+            "outputs": list(dict.fromkeys([*subgraph["outputs"], *(numbers[n] for n in fetch)])),
+            "operators": [o for o in subgraph["operators"] if drawn.isdisjoint(map(int, o["outputs"]))],
+        }
+        entries = {"inputs": [*signature["inputs"]], "outputs": [*signature["outputs"]]}
+        own = {entry["name"] for entry in signature["outputs"]}
+        for side, names in (("inputs", draws), ("outputs", [n for n in fetch if n not in own])):
+            entries[side] += [{"name": name, "tensor_index": numbers[name]} for name in names]
+        copy = {
+            **model,
+            "subgraphs": [wider if s is subgraph else s for s in model["subgraphs"]],
+            "signature_defs": [{**signature, **entries} if s is signature else s for s in model["signature_defs"]],
+        }
+        file = Path(folder) / f"{next(turns)} {loaded.path.name}"
+        encode(copy).write(file)
+        with loaded.pool.process(loaded.runtime).load(str(file), kind="litert", signature=key) as one:
+            taken = fed.keys() | set(draws)
+            yield lambda inputs, names: one.run_all([{n: a for n, a in i.items() if n in taken} for i in inputs], names)
+
     def run(feeds: Feeds, fetch: Sequence[str]) -> dict[str, np.ndarray]:
-        given = {name: array for name, array in feeds.items() if name in fed}
-        wanted = [name for name in fetch if numbers[name] in made]
-        values = {n: given[n] for n in fetch if n in given}
+        values = {n: feeds[n] for n in fetch if n in feeds}
+        wanted = [name for name in fetch if numbers[name] in made and name not in values]
         others = [n for n in fetch if n not in values and n not in wanted]
         values |= {n: _constant(model, tensors[kept.get(numbers[n], numbers[n])]) for n in others}
         if wanted:
-            more = [{"name": name, "tensor_index": numbers[name]} for name in wanted]
-            opened = {**signature, "outputs": more}
-            wider = {**subgraph, "outputs": list(dict.fromkeys([*subgraph["outputs"], *(numbers[n] for n in wanted)]))}
-            copy = {
-                **model,
-                "subgraphs": [wider if s is subgraph else s for s in model["subgraphs"]],
-                "signature_defs": [opened if s is signature else s for s in model["signature_defs"]],
-            }
-            encode(copy).write(file)
-            with loaded.pool.process(loaded.runtime).load(str(file), kind="litert", signature=key) as one:
-                values.update(one.run(given, wanted))
+            with opened({s.tensor: feeds[s.tensor].ndim for s in samplers if s.tensor in feeds}, wanted) as run_all:
+                values.update(run_all([feeds], wanted)[0])
         return values
 
     with scratch_folder() as folder:
-        file = folder / loaded.path.name
-        yield InnerTensors(view, run)
+        yield InnerTensors(view, run, samplers=samplers, opened=opened)
+
+
+def _samplers(model: Table, subgraph: Table) -> tuple[Sampler, ...]:
+    """The operators of a function that draw."""
+    found, tensors = [], subgraph["tensors"]
+    for operator in subgraph["operators"]:
+        kind = _DRAWS.get(operator_of(model["operator_codes"][operator.get("opcode_index", 0)]))
+        if kind is not None:
+            scores = tensors[int(operator["inputs"][0])]["name"] if kind == "categorical" else None
+            found.append(Sampler(tensors[int(operator["outputs"][0])]["name"], kind, scores))
+    return tuple(found)
 
 
 def _narrow_weights(model: Table, subgraph: Table) -> dict[int, int]:

@@ -6,7 +6,7 @@ It gives its outputs only: for the tensors inside, a copy with further outputs i
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,8 @@ from converters.files.fetch import read_bytes
 from converters.files.folders import scratch_folder
 from converters.files.memory_mapped import Mapped
 from converters.formats.format import Port, Ports
-from converters.formats.intermediate_tensors import Feeds, InnerTensors, Loaded, View
+from converters.formats.intermediate_tensors import Feeds, InnerTensors, Loaded, RunAll, View
+from converters.formats.onnx.edit import cut, lift_draws, samplers_of
 from converters.formats.onnx.messages import files_of
 from converters.formats.onnx.proto import array_of, decode_model, dtype_name, load_external
 from converters.formats.onnx.tensor_map import TENSORS_KEY, loads
@@ -61,9 +62,13 @@ def misstated(path: Path, signature: PolicySignature) -> str | None:
     return f"its metadata has {other[0]!r} as {str(found.get(other[0], 'missing'))[:80]!r}" if other else None
 
 
-@contextmanager
-def inner(loaded: Loaded) -> Iterator[InnerTensors]:
+def inner(loaded: Loaded) -> AbstractContextManager[InnerTensors]:
     """Those of a model, in the same runtime; its values are found by the map that the writer left in it."""
+    return _inner(loaded)
+
+
+@contextmanager
+def _inner(loaded: Loaded) -> Iterator[InnerTensors]:
     detached, files = Detached(), Mapped()
     model = decode_model(files.read(loaded.path), detached)
     load_external([model.graph], loaded.path.parent, detached, files.read)
@@ -77,27 +82,39 @@ def inner(loaded: Loaded) -> Iterator[InnerTensors]:
         found = names.view(tensor)
         return found if found is not None and found.name in made | constants | fed else None
 
+    samplers = samplers_of(model)
+
+    @contextmanager
+    def opened(draws: Mapping[str, int], fetch: Sequence[str]) -> Iterator[RunAll]:
+        open_model = type(model)()
+        open_model.CopyFrom(model)
+        if draws:
+            open_model = cut(lift_draws(open_model, draws), fetch)
+        known = {o.name for o in open_model.graph.output}
+        for name in fetch:
+            if name not in known:
+                open_model.graph.output.add(name=name)
+        taken = {v.name for v in open_model.graph.input} - constants
+        with scratch_folder() as folder:
+            file = folder / loaded.path.name
+            for name, data in files_of(open_model, detached, file.name).items():
+                data.write(file.with_name(name))
+            one = loaded.pool.process(loaded.runtime).load(str(file), kind="graph")
+        with one:
+            yield lambda inputs, names: one.run_all([{n: a for n, a in i.items() if n in taken} for i in inputs], names)
+
     def run(feeds: Feeds, fetch: Sequence[str]) -> dict[str, np.ndarray]:
         files.let_go()  # what was fetched before, tensor for tensor
         values = {t.name: array_of(t, detached) for t in graph.initializer if t.name in fetch}
-        values.update({name: feeds[name] for name in fetch if name in fed})
-        wanted = [name for name in fetch if name in made]
+        values.update({name: feeds[name] for name in fetch if name in feeds})
+        wanted = [name for name in fetch if name in made and name not in values]
         if wanted:
-            open_model = type(model)()
-            open_model.CopyFrom(model)
-            known = {o.name for o in graph.output}
-            for name in wanted:
-                if name not in known:
-                    open_model.graph.output.add(name=name)
-            for name, data in files_of(open_model, detached, file.name).items():
-                data.write(file.with_name(name))
-            with loaded.pool.process(loaded.runtime).load(str(file), kind="graph") as opened:
-                values.update(opened.run({n: a for n, a in feeds.items() if n in fed}, wanted))
+            draws = {s.tensor: feeds[s.tensor].ndim for s in samplers if s.tensor in feeds}
+            with opened(draws, wanted) as run_all:
+                values.update(run_all([feeds], wanted)[0])
         return values
 
-    with scratch_folder() as folder:
-        file = folder / loaded.path.name
-        yield InnerTensors(view, run)
+    yield InnerTensors(view, run, samplers=samplers, opened=opened)
 
 
 def origins(path: Path) -> Mapping[str, str]:

@@ -6,41 +6,70 @@ not depend on is taken out, so that inputs which only training needs do not have
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from converters.formats.onnx import messages
+from converters.formats.intermediate_tensors import Sampler
+from converters.formats.onnx.messages import node as new_node
+from converters.formats.onnx.messages import tensor, value_info
 from converters.graph.nodes import reachable
 from converters.graph.types import FLOAT32
 
 _FLOAT, _INT = 1, 2  # AttributeProto.AttributeType; FLOAT is 1 in TensorProto.DataType too
-_NORMAL = ("RandomNormal", "RandomNormalLike")
+_INT64 = 7  # TensorProto.DataType
+_KINDS = {
+    "RandomNormal": "normal",
+    "RandomNormalLike": "normal",
+    "RandomUniform": "uniform",
+    "RandomUniformLike": "uniform",
+    "Multinomial": "categorical",
+}
 
 
-def lift_draws(model: Any, draws: Collection[str]) -> Any:
-    """The model with N(0, 1) draws as inputs, and integer seeds (tf2onnx 1.5.5) as the floats that ONNX asks for.
+def samplers_of(model: Any) -> tuple[Sampler, ...]:
+    """The samplers of a model's own graph that one draw per class or number comes from."""
+    found = []
+    for node in model.graph.node:
+        kind = _KINDS.get(node.op_type, "")
+        numbers = {a.name: a.f for a in node.attribute if a.type == _FLOAT}
+        mean, scale = numbers.get("mean", 0.0), numbers.get("scale", 1.0)
+        if kind == "uniform":
+            mean = numbers.get("low", 0.0)
+            scale = numbers.get("high", 1.0) - mean
+        if kind:
+            scores = node.input[0] if kind == "categorical" else None
+            long = any(a.name == "dtype" and a.i == _INT64 for a in node.attribute)
+            dtype = "float32" if scores is None else "int64" if long else "int32"
+            found.append(Sampler(node.output[0], kind, scores, mean, scale, dtype))
+    return tuple(found)
 
-    A sampler of N(mean, scale²) becomes the input times ``scale`` plus ``mean``.
+
+def lift_draws(model: Any, draws: Collection[str] | Mapping[str, int]) -> Any:
+    """The model with draws as inputs, of ranks that may be known, and integer seeds (tf2onnx 1.5.5) as floats.
+
+    A sampler of N(mean, scale²) becomes the input times ``scale`` plus ``mean``, one of other numbers likewise.
     """
-    wanted = frozenset(draws)
+    samplers = {sampler.tensor: sampler for sampler in samplers_of(model)}
+    wanted, ranks = frozenset(draws), draws if isinstance(draws, Mapping) else {}
     graph = model.graph
     nodes: list[Any] = []
     for node in graph.node:
-        if node.op_type not in _NORMAL or not wanted.intersection(node.output):
+        if node.op_type not in _KINDS or not wanted.intersection(node.output):
             _repair_seed(node)
             nodes.append(node)
             continue
         (name,) = node.output
-        graph.input.append(messages.value_info(name, FLOAT32, None))
-        numbers = {a.name: a.f for a in node.attribute if a.type == _FLOAT}
+        sampler = samplers[name]
+        dims = [f"{name}/{axis}" for axis in range(ranks[name])] if name in ranks else None
+        graph.input.append(value_info(name, np.dtype(sampler.dtype), dims))
         moved = name
-        for key, op, plain in (("scale", "Mul", 1.0), ("mean", "Add", 0.0)):
-            if numbers.get(key, plain) != plain:
-                value = messages.tensor(np.array(numbers[key], FLOAT32), f"{name}/{key}")
+        for key, op, number, plain in (("scale", "Mul", sampler.scale, 1.0), ("mean", "Add", sampler.mean, 0.0)):
+            if number != plain:
+                value = tensor(np.array(number, FLOAT32), f"{name}/{key}")
                 graph.initializer.append(value)
-                nodes.append(messages.node(op, [moved, value.name], [f"{name}/{op}"]))
+                nodes.append(new_node(op, [moved, value.name], [f"{name}/{op}"]))
                 moved = f"{name}/{op}"
         if moved != name:
             _rename_reads(graph.node, name, moved)

@@ -10,12 +10,13 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+from msgspec.structs import replace
 
 from converters.files.fetch import read_bytes
 from converters.formats.format import Ports
 from converters.formats.frozen_graph.reader import from_graph_def
 from converters.formats.frozen_graph.subgraph import subgraph
-from converters.formats.intermediate_tensors import Feeds, InnerTensors, Loaded, own_names
+from converters.formats.intermediate_tensors import Feeds, InnerTensors, Loaded, own_names, samplers_of
 from converters.formats.saved_model.reader import read_saved_model
 from converters.formats.saved_model.source import FILE, frozen_model, values_beside
 from converters.formats.source import OriginalRun
@@ -61,5 +62,16 @@ def inner(loaded: Loaded) -> Iterator[InnerTensors]:
     def run(feeds: Feeds, fetch: Sequence[str]) -> dict[str, np.ndarray]:
         return model.run({fed[n]: a for n, a in feeds.items() if n in fed}, fetch)
 
+    given = {name: normal_ref(tensor.name) for name, tensor in saved.signature.outputs.items()}
+
+    def run_all(inputs: Sequence[Feeds], fetch: Sequence[str]) -> list[dict[str, np.ndarray]]:
+        """Outputs go by the signature's names."""
+        names = {given.get(n, n): n for n in fetch}
+        fitting = [{fed.get(n, n): a for n, a in feeds.items()} for feeds in inputs]
+        return [{names[n]: a for n, a in answer.items()} for answer in model.run_all(fitting, list(names))]
+
+    samplers = samplers_of({n.name: (n.op, n.input) for n in definition.node})
     with model:
-        yield InnerTensors(own_names(n.name for n in definition.node), run)
+        view = own_names(n.name for n in definition.node)
+        opened = replace(loaded, run_all=run_all).open_any
+        yield InnerTensors(view, run, samplers=samplers, opened=opened)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -16,9 +17,10 @@ from typing import Any
 
 from converters.files.fetch import MAX_BYTES, read_bytes
 from converters.files.file_probe import json_in
+from converters.files.folders import scratch_folder
 from converters.formats.format import Port, Ports
 from converters.formats.frozen_graph.subgraph import COMPUTING
-from converters.formats.intermediate_tensors import InnerTensors, Loaded, own_names
+from converters.formats.intermediate_tensors import InnerTensors, Loaded, RunAll, own_names, samplers_of
 from converters.formats.tfjs.reader import MODEL, read_signature, shard
 from converters.graph.nodes import Node
 from converters.graph.ops.table import CALLING, ORDERING, unsupported_error
@@ -37,10 +39,30 @@ def ports(path: Path) -> Ports:
 
 def inner(loaded: Loaded) -> AbstractContextManager[InnerTensors]:
     """Those of a folder with a model.json; what was fused with its bias or activation is not there."""
-    model = json_in((loaded.path / "model.json").read_bytes())
-    return contextlib.nullcontext(
-        InnerTensors(own_names(n["name"] for n in model["modelTopology"]["node"]), loaded.run)
-    )
+    model = json_in((loaded.path / MODEL).read_bytes())
+    nodes = model["modelTopology"]["node"]
+    samplers = samplers_of({n["name"]: (n["op"], n.get("input", ())) for n in nodes}, "int32")
+
+    @contextlib.contextmanager
+    def opened(draws: Mapping[str, int], fetch: Sequence[str]) -> Iterator[RunAll]:
+        """A copy with inputs in place of samplers: TensorFlow.js takes no classes for the output of one."""
+        if not draws:
+            yield loaded.run_all
+            return
+        kinds = {s.tensor: "DT_INT32" if s.scores is not None else "DT_FLOAT" for s in samplers if s.tensor in draws}
+        given = {n: {"name": n, "op": "Placeholder", "attr": {"dtype": {"type": kind}}} for n, kind in kinds.items()}
+        signature = {**(model.get("signature") or {})}
+        taken = {n: {"name": f"{n}:0", "dtype": kind} for n, kind in kinds.items()}
+        signature["inputs"] = {**signature.get("inputs", {}), **taken}
+        graph = {**model["modelTopology"], "node": [given.get(n["name"], n) for n in nodes]}
+        with scratch_folder() as folder:
+            copy = shutil.copytree(loaded.path, Path(folder) / "model")
+            (copy / MODEL).write_text(json.dumps({**model, "modelTopology": graph, "signature": signature}), "utf-8")
+            with loaded.pool.process(loaded.runtime).load(str(copy), kind="graph", format="tfjs") as one:
+                yield one.run_all
+
+    view = own_names(n["name"] for n in nodes)
+    return contextlib.nullcontext(InnerTensors(view, loaded.run, samplers=samplers, opened=opened))
 
 
 #: What the official converter makes of other ops, and what TensorFlow 2 writes loops with: in memory, all of them.

@@ -153,5 +153,6 @@ OPS = (
         sampler="categorical",
     ),
 )
-#: Every op that draws.
-SAMPLERS = frozenset(op.name for op in OPS)
+#: What every op draws that draws.
+KINDS = {op.name: op.sampler for op in OPS}
+SAMPLERS = frozenset(KINDS)

@@ -17,7 +17,7 @@ from converters.formats.programs.artifact import contract_held
 from converters.formats.programs.members import Header, header_of
 from converters.formats.registry import WRITTEN
 from converters.runtimes.agents import AGENTS, CHOSEN, EVERY, SIZES, UNUSUAL, shown, sized
-from exporter.verify.checks.draws import DEPENDENT, DRAWS, STARTS, least_likely, likely
+from exporter.verify.checks.generators import DEPENDENT, likely, wrong_classes
 from exporter.verify.checks.numbers import rank
 from exporter.verify.difference import Difference, wrong
 from exporter.verify.findings import Acting, Bisection, Draws, Finding
@@ -34,6 +34,8 @@ Arrays = Mapping[str, np.ndarray]
 ANEW = "an episode that begins with the same seed again does not go as it did"
 ALIKE = "agents whose draws begin with other seeds draw alike"
 SHARED = "its numbers hang together: one draw serves several"
+#: Decisions of each agent in each step where something is drawn, and as an episode begins.
+DRAWS, STARTS = 512, 48
 #: Numbers of noise that are looked at, all steps and agents together.
 _NOISE = 4096
 
@@ -228,17 +230,20 @@ class _Played:
         odds = np.concatenate([s.expected[scores.name].reshape(AGENTS, -1) for s in self.steps])
         decided = np.isfinite(odds).any(axis=1) & ~np.isnan(odds).any(axis=1)
         for name, drawn in made.items():
-            p_value, branch, worst = least_likely(
-                np.concatenate(drawn)[decided].astype(np.int64), odds[decided], self.trial.signature.branches
-            )
-            place = int(np.flatnonzero(decided)[worst])
-            step, agent = self.steps[place // AGENTS], place % AGENTS
-            where = f"{step.case.name}, agent {agent + 1}"
-            difference, begins = likely(p_value), None
+            every = np.concatenate(drawn)[decided].astype(np.int64)
+            rows, log_probs = np.concatenate([*every.swapaxes(0, 1)]), np.tile(odds[decided], (every.shape[1], 1))
+            branches = self.trial.signature.branches
+            difference, branch = wrong_classes(rows, log_probs, branches, self.participant)
+            alone = [
+                rank(wrong_classes(each, np.tile(row, (len(each), 1)), branches, self.participant)[0])
+                for each, row in zip(every, odds[decided], strict=True)
+            ]
+            place = int(np.flatnonzero(decided)[max(range(len(alone)), key=lambda i: alone[i])])
+            step, agent, begins = self.steps[place // AGENTS], place % AGENTS, None
             if name != CHOSEN:
                 row = {n: a[agent : agent + 1] if len(a) == AGENTS else a for n, a in step.case.feeds.items()}
                 begins = self.trial.bisect(self.participant, name, difference, row, branch)
-            yield self._finding(Draws, name, difference, where, begins)
+            yield self._finding(Draws, name, difference, f"{step.case.name}, agent {agent + 1}", begins)
 
     def densities(self) -> Iterator[Finding]:
         """Numbers that a sampler inside draws: as the reference draws them, for each agent."""
@@ -313,4 +318,4 @@ def noise_difference(drawn: np.ndarray) -> Difference:
     if apart := dependent([ranks(drawn)], 3.0 * drawn.shape[1]):
         return wrong(DEPENDENT.format(apart))
     independent = np.random.default_rng(0).standard_normal(drawn.shape)
-    return wrong(SHARED) if columns_related(independent, drawn) else difference
+    return wrong(SHARED) if columns_related(ranks(independent), ranks(drawn)) else difference

@@ -1,99 +1,93 @@
-"""Numbers that are drawn, from noise in the graph or of a candidate's own, have the reference's distribution."""
+"""Numbers of an artefact that is not cut have the reference's distribution, at inputs that take turns in one batch.
+
+With ``DENSITY_DRAWS`` draws, a shift of half the spread at one of ``KINDS`` inputs is seen, and of a seventh at all.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from exporter.verify.checks.draws import (
-    DEPENDENT,
-    DRAWS,
-    REPEATED,
-    REPEATED_CALLS,
-    STARTS,
-    Arrays,
-    likely,
-    repeated_draws,
-)
+from exporter.verify.checks.generators import DEPENDENT, likely
+from exporter.verify.checks.mixed import MIXED, Place, places, rows_at
 from exporter.verify.difference import Difference, wrong
 from exporter.verify.findings import Draws, Finding
 from exporter.verify.participants import Participant
 from exporter.verify.statistics import columns_related, dependent, ranks, same_distribution
 from exporter.verify.trial import Trial
-from signatures.roles import Role
-from signatures.sampling import Case
 
 #: Rows of policies that see vectors alone, instead of ``DRAWS``: a spread that is a quarter too wide is seen. So many
 #: pictures or lists of entities do not fit into the memory that a runtime is given.
-DENSITY_DRAWS = 4096
+DENSITY_DRAWS, DRAWS = 4096, 512
+#: Inputs that take turns.
+KINDS = 8
 #: Draws of which so many are one number may be it all by chance.
 _NEARLY_ALL = 0.95
+#: Draws this near, as a share of their spread, count as equal where those of all inputs are looked at together.
+_NEAR = 1e-3
+Arrays = dict[str, np.ndarray]
 
 
-def densities(trial: Trial, participant: Participant) -> Iterator[Finding]:
+def densities(trial: Trial, participant: Participant, names: Sequence[str]) -> Iterator[Finding]:
     """Compare draws of numbers: each number of an output by itself (Kolmogorov-Smirnov for two samples of one size).
 
-    Both are drawn many times for one input, the reference by the numpy kernels.
+    Both are drawn many times, the reference by the numpy kernels; classes are taken for numbers.
     """
-    names = _drawn_numbers(trial, participant)
     vectors = all(len(s.shape) <= 2 for s in trial.signature.observations)
     count = DENSITY_DRAWS if vectors else DRAWS
     if not names or not trial.allowance(participant, "draws").takes(count, f"{count} draws of numbers"):
         return
-    case = trial.cases[0]
-    feeds = _rows(trial, case, count)
-    samples = [run([feeds], names)[0] for run in (trial.reference.run, participant.run)]
+    kinds = places(trial)[:KINDS]
+    rows = [kinds[i % len(kinds)] for i in range(count)]
+    runs = (trial.reference.run, participant.run)
+    samples = [run(rows_at(trial, rows, run=i), names)[0] for i, run in enumerate(runs)]
     said = {n: text for n in names if (text := _shared_otherwise(*(_columns(s[n]) for s in samples)))}
-    _draw_shared_anew(trial, participant, [n for n in names if n not in said], samples)
-    said = {**_repetitions(trial, participant, feeds, names, samples), **said}
+    _draw_shared_anew(trial, participant, rows[:KINDS], [n for n in names if n not in said], samples)
     for name in names:
         difference = wrong(said[name]) if name in said else _difference(trial, participant, name, samples)
-        yield trial.finding(Draws, participant, name, difference, case.name)
+        yield trial.finding(Draws, participant, name, difference, MIXED)
 
 
-def _drawn_numbers(trial: Trial, participant: Participant) -> list[str]:
-    """The participant's outputs of which all or some numbers are drawn."""
-    drawn = [n for n in participant.outputs if trial.is_drawn(n, participant) or n in trial.reference.partly_drawn]
-    return [n for n in drawn if trial.signature.output(n).dtype == "float32"]
-
-
-def _draw_shared_anew(trial: Trial, participant: Participant, names: list[str], samples: list[Arrays]) -> None:
+def _draw_shared_anew(
+    trial: Trial, participant: Participant, rows: Sequence[Place], names: list[str], samples: list[Arrays]
+) -> None:
     """Replace samples of which all rows share one draw, or that none was drawn for: by as many runs as draws."""
-    shared = [n for n in names if any((s[n] == s[n][:1]).all() for s in samples)]
+    shared = [n for n in names if any(any((s[n][k::KINDS] == s[n][k]).all() for k in range(KINDS)) for s in samples)]
     if not shared:
         return
-    rows = [_rows(trial, trial.cases[0], 1, i) for i in range(DRAWS)]
-    each = [run(rows, shared) for run in (trial.reference.run, participant.run)]
-    for sample, every in zip(samples, each, strict=True):
+    for number, (sample, run) in enumerate(zip(samples, (trial.reference.run, participant.run), strict=True)):
+        every = run([rows_at(trial, rows, run=number * DRAWS + i)[0] for i in range(DRAWS)], shared)
         sample.update({n: np.concatenate([one[n] for one in every]) for n in shared})
 
 
-def _repetitions(
-    trial: Trial, participant: Participant, feeds: Arrays, names: list[str], samples: list[Arrays]
-) -> dict[str, str]:
-    """Output → what is wrong with draws that come again: after every start, or in every call."""
-    reference, own = samples
-    starts = repeated_draws(trial, participant, lambda run: run([feeds], names)[0])
-    # Where all rows are the same nothing was drawn, or once for all of them: the distribution says so.
-    said = {n: REPEATED for n in starts if (own[n] != own[n][:1]).any()}
-    if participant.runtime == "numpy":
-        return said
-    again = _rows(trial, trial.cases[0], STARTS)
-    one, other = participant.run([again, again], names)
-    alike = [n for n in names if np.array_equal(one[n], other[n]) and _varies(reference[n])]
-    return {**dict.fromkeys(alike, REPEATED_CALLS), **said}
-
-
 def _difference(trial: Trial, participant: Participant, name: str, samples: list[Arrays]) -> Difference:
-    """How far the distribution of an output is from the reference's, its numbers together and each by itself."""
+    """How far the distribution of an output is from the reference's: for each input, and all together.
+
+    Its numbers together and each by itself. All together, what is at one input is brought to one mean and spread.
+    """
     one, other = (_columns(s[name]) for s in samples)
-    if one.shape == other.shape and (difference := _joint(one, other)) is not None:
+    if one.shape != other.shape:
+        return wrong(f"shape {list(samples[1][name].shape)} instead of {list(samples[0][name].shape)}")
+    alike = [_of_one_input(a, b) for a, b in ((one[k::KINDS], other[k::KINDS]) for k in range(KINDS))]
+    a, b = (np.concatenate(each) for each in zip(*alike, strict=True))
+    if np.isfinite(other).all() and (difference := _joint(_ranks(one), _ranks(other))) is not None:
         return difference
     tolerance = trial.tolerance(name, participant)
-    pairs = zip(one.T, other.T, strict=True)
-    p_values = [same_distribution(a, b, tolerance.atol, tolerance.rtol) for a, b in pairs]
-    return likely(min(p_values, default=1.0))
+    p_values = [same_distribution(x, y, _NEAR, 0.0) for x, y in zip(a.T, b.T, strict=True)]
+    for k in range(KINDS):
+        pairs = zip(one[k::KINDS].T, other[k::KINDS].T, strict=True)
+        p_values += [same_distribution(x, y, tolerance.atol, tolerance.rtol) for x, y in pairs]
+    return likely(min(1.0, min(p_values) * len(p_values)))
+
+
+def _of_one_input(one: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two samples of one input, brought to their common mean and spread; zeros where they hardly vary."""
+    both = np.concatenate([one, other]).astype(np.float64)
+    spread = both.std(axis=0)
+    varies = spread > _NEAR * (1 + np.abs(both).max(axis=0))
+    made = np.divide(both - both.mean(axis=0), spread, out=np.zeros_like(both), where=varies)
+    return made[: len(one)], made[len(one) :]
 
 
 def _columns(drawn: np.ndarray) -> np.ndarray:
@@ -118,22 +112,18 @@ def _shared_otherwise(reference: np.ndarray, drawn: np.ndarray) -> str | None:
     return None
 
 
+def _ranks(drawn: np.ndarray) -> np.ndarray:
+    """The rank of each draw among those of its input, in the order of the rows."""
+    made = np.empty(drawn.shape)
+    for k in range(KINDS):
+        made[k::KINDS] = ranks(drawn[k::KINDS])
+    return made
+
+
 def _joint(reference: np.ndarray, drawn: np.ndarray) -> Difference | None:
-    """What is wrong with numbers [draws, columns] together, whatever each is by itself."""
-    if np.isfinite(drawn).all() and (apart := dependent([ranks(drawn)], 3.0 * drawn.shape[1])):
+    """What is wrong with the ranks of numbers [draws, columns] together, whatever each is by itself."""
+    if apart := dependent([drawn], 3.0 * drawn.shape[1]):
         return wrong(DEPENDENT.format(apart))
     if columns_related(reference, drawn):
         return wrong("its numbers hang together otherwise than the reference's: one draw serves several")
     return None
-
-
-def _rows(trial: Trial, case: Case, count: int, run: int = 0) -> dict[str, np.ndarray]:
-    """The first row of a case ``count`` times, with noise drawn for each."""
-    rng = np.random.default_rng([trial.options.seed, run])
-    feeds = {}
-    for spec in trial.signature.inputs:
-        array = case.feeds[spec.name]
-        array = np.repeat(array[:1], count, axis=0) if spec.batched else array
-        noise = spec.role is Role.NOISE
-        feeds[spec.name] = rng.standard_normal(array.shape).astype(np.float32) if noise else array
-    return feeds
