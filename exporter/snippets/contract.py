@@ -35,6 +35,8 @@ _FEED = {
     Role.MEMORY_IN: "the memory of the step before; zeros at the start of an episode",
     Role.PARAMETER: "the source's own placeholder: give it its value",
 }
+#: Roles of actions that are odds: classes are drawn by them.
+ODDS = (Role.LOG_PROBS, Role.PROBS)
 #: How many steps a snippet plays where the policy remembers.
 STEPS = 3
 #: Comments are folded at about this many characters.
@@ -118,8 +120,14 @@ class Bundle(Struct, frozen=True):
 
     @property
     def fetched_outputs(self) -> dict[str, TensorSpec]:
-        """Variable → the output without chance (a draw from log-probabilities is for who knows how)."""
+        """Variable → the output without chance."""
         return {name: self.plain(head) for name, head in zip(self.variables, self.heads, strict=True)}
+
+    @property
+    def played_outputs(self) -> dict[str, TensorSpec]:
+        """Variable → the output that a snippet makes its action of: odds where there are some, of which it draws."""
+        pairs = zip(self.variables, self.heads, strict=True)
+        return {name: head if head.role in ODDS else self.plain(head) for name, head in pairs}
 
     @property
     def discrete_variable(self) -> str:

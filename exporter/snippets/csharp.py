@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from converters.formats.programs.members import header_of
 from exporter.snippets.contract import (
+    ODDS,
     STEPS,
     Bundle,
     action_meaning,
@@ -45,15 +46,19 @@ def tensorflowsharp(bundle: Bundle) -> str:
         lines += [f"// {line}" for line in meaning(bundle, spec)]
         value = bundle.kept_variables.get(spec.name) or _array(spec)
         lines.append(f"runner.AddInput(graph[{string_literal(spec.name)}][0], {value});")
-    fetched = bundle.fetched_outputs
+    fetched = bundle.played_outputs
+    before = [*(["var random = new Random();"] if any(s.role in ODDS for s in fetched.values()) else []), *before]
     outputs = [*fetched.values()] if memory is None else [*fetched.values(), bundle.signature.output(memory[1])]
     lines += [f"runner.Fetch(graph[{string_literal(spec.name)}][0]);" for spec in outputs]
     lines.append("TFTensor[] output = runner.Run();")
     for i, (name, spec) in enumerate(fetched.items()):
         lines += [f"// {line}" for line in action_meaning(bundle, bundle.heads[i])]
-        chance = bundle.heads[i].name
-        hint = "" if chance == spec.name else f"  // deterministic; drawn: graph[{string_literal(chance)}]"
-        lines.append(f"var {name} = ({_kind(spec)})output[{i}].GetValue();{hint}")
+        head, value = bundle.heads[i], f"({_kind(spec)})output[{i}].GetValue()"
+        if spec.role in ODDS:
+            lines += _draws(bundle, name, spec, value)
+            continue
+        hint = "" if head == spec else f"  // deterministic; drawn: graph[{string_literal(head.name)}]"
+        lines.append(f"var {name} = {value};{hint}")
     if memory is not None:
         lines.append(f"memory = ({_kind(bundle.signature.output(memory[1]))})output[{len(fetched)}].GetValue();")
     if previous is not None:
@@ -75,6 +80,36 @@ def tensorflowsharp(bundle: Bundle) -> str:
         path=string_literal(bundle.path(f"{bundle.name}.bytes")),
         play=play,
     )
+
+
+def _draws(bundle: Bundle, name: str, odds: TensorSpec, value: str) -> list[str]:
+    """Lines that draw a class of each branch, of log-probabilities or probabilities."""
+    sizes, score = ", ".join(map(str, bundle.signature.branches)), "odds[agent, start + i]"
+    plain = bundle.plain(odds)
+    hint = "" if plain == odds else f"  // deterministic: graph[{string_literal(plain.name)}]"
+    return [
+        f"var odds = {value};{hint}",
+        f"int[] sizes = {{ {sizes} }};",
+        f"var {name} = new int[odds.GetLength(0), sizes.Length];",
+        "// a class from each branch: the largest of log-probability + Gumbel noise",
+        f"for (var agent = 0; agent < {name}.GetLength(0); agent++)",
+        "{",
+        "    for (int branch = 0, start = 0; branch < sizes.Length; start += sizes[branch++])",
+        "    {",
+        "        var best = double.NegativeInfinity;",
+        "        for (var i = 0; i < sizes[branch]; i++)",
+        "        {",
+        f"            var p = {score if odds.role is Role.LOG_PROBS else f'Math.Log({score})'};",
+        "            var drawn = p - Math.Log(-Math.Log(random.NextDouble()));",
+        "            if (drawn > best)",
+        "            {",
+        "                best = drawn;",
+        f"                {name}[agent, branch] = i;",
+        "            }",
+        "        }",
+        "    }",
+        "}",
+    ]
 
 
 def _kind(spec: TensorSpec) -> str:

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from enum import StrEnum
 
 from exporter.snippets.contract import (
+    ODDS,
     STEPS,
     Bundle,
     action_meaning,
@@ -62,7 +63,7 @@ def acting_ort(bundle: Bundle, place: Place = Place.PAGE) -> str:
 def plain_tfjs(bundle: Bundle, place: Place = Place.PAGE) -> str:
     """``tf.loadGraphModel`` alone."""
     run = "const outputs = model.predict(feeds);  // tensors by name; dispose of them in a long run: tf.dispose"
-    play = _plain(bundle, _tf_value, run, "const {} = await outputs[{}].array();")
+    play = _plain(bundle, _tf_value, run, "await outputs[{}].array()")
     if place is Place.NODE:  # there is no loader for files in the package
         return _program(bundle, TFJS, "plain_tfjs_node.mjs", "tfjs/", play, place)
     return _program(bundle, TFJS, "plain_tfjs.mjs", "tfjs/model.json", play, place)
@@ -71,7 +72,7 @@ def plain_tfjs(bundle: Bundle, place: Place = Place.PAGE) -> str:
 def plain_ort(bundle: Bundle, place: Place = Place.PAGE) -> str:
     """onnxruntime-web alone."""
     run = "const outputs = await session.run(feeds);"
-    play = _plain(bundle, _ort_value, run, "const {} = Array.from(outputs[{}].data, Number);")
+    play = _plain(bundle, _ort_value, run, "Array.from(outputs[{}].data, Number)")
     frame = "plain_ort_node.mjs" if place is Place.NODE else "plain_ort.mjs"
     return _program(bundle, ORT, frame, f"{bundle.name}.onnx", play, place)
 
@@ -115,22 +116,50 @@ def _agents(bundle: Bundle) -> str:
 
 
 def _plain(bundle: Bundle, value: Callable[[TensorSpec], str], run: str, read: str) -> str:
-    """The lines from feeds to actions, with what goes from step to step; ``read`` takes a variable and an output."""
+    """The lines from feeds to actions, with what goes from step to step; ``read`` takes an output."""
     lines = ["const feeds = {"]
     for spec in bundle.signature.inputs:
         lines += _entry(bundle, spec, bundle.kept_variables.get(spec.name) or value(spec))
     lines += ["};", run]
-    lines += [read.format(name, string_literal(output.name)) for name, output in bundle.fetched_outputs.items()]
-    before = bundle.beginnings("let {} = {};  // {}", value)
+    for (name, output), head in zip(bundle.played_outputs.items(), bundle.heads, strict=True):
+        found, tensorflow = read.format(string_literal(output.name)), value is _tf_value
+        drawn = f"({found}).map(draw)" if tensorflow else f"draw({found})"
+        lines.append(f"const {name} = {drawn if output.role in ODDS else found};{_other(bundle, head)}")
+    before = [*_draw(bundle), *bundle.beginnings("let {} = {};  // {}", value)]
     previous = bundle.previous
     lines += [f"{variable} = outputs[{string_literal(given)}];" for _, given, variable in bundle.memories]
     if previous is not None:
         lines.append(_again(previous, bundle.discrete_variable, tensorflow=value is _tf_value))
     lines += [f"// {_safe(line)}" for head in bundle.heads for line in action_meaning(bundle, head)]
-    chance = [f"outputs[{string_literal(h.name)}]" for h in bundle.heads if bundle.plain(h) != h]
-    hint = f"  // deterministic; drawn: {', '.join(chance)}" if chance else ""
-    lines.append(f"console.log({', '.join(bundle.fetched_outputs)});{hint}")
+    lines.append(f"console.log({', '.join(bundle.variables)});")
     return "\n".join([*before, *_loop_lines(bundle, lines)])
+
+
+def _other(bundle: Bundle, head: TensorSpec) -> str:
+    """The comment that names the action without chance, or with it, that a line does not take."""
+    plain = bundle.plain(head)
+    if plain == head:
+        return ""
+    what, other = ("drawn; deterministic", plain) if head.role in ODDS else ("deterministic; drawn", head)
+    return f"  // {what}: outputs[{string_literal(other.name)}]"
+
+
+def _draw(bundle: Bundle) -> list[str]:
+    """The function that draws a class of each branch, where an action is odds."""
+    roles = [head.role for head in bundle.heads if head.role in ODDS]
+    if not roles:
+        return []
+    score = "p" if roles[0] is Role.LOG_PROBS else "Math.log(p)"
+    return [
+        "// a class from each branch: the largest of log-probability + Gumbel noise",
+        "const draw = (row) => {",
+        "  let end = 0;",
+        f"  return {list(bundle.signature.branches)}.map((size) => {{",
+        f"    const drawn = row.slice(end, (end += size)).map((p) => {score} - Math.log(-Math.log(Math.random())));",
+        "    return drawn.indexOf(Math.max(...drawn));",
+        "  });",
+        "};",
+    ]
 
 
 def _again(spec: TensorSpec, taken: str, *, tensorflow: bool) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from converters.formats.registry import ONNX, SAVED_MODEL
 from exporter.snippets.contract import (
+    ODDS,
     STEPS,
     Bundle,
     action_meaning,
@@ -103,7 +104,7 @@ def _feed_expression(bundle: Bundle, spec: TensorSpec) -> str:
 
 
 def _draws(bundle: Bundle) -> bool:
-    return bool(bundle.signature.noise) or any(h.role in (Role.LOG_PROBS, Role.PROBS) for h in bundle.heads)
+    return bool(bundle.signature.noise) or any(h.role in ODDS for h in bundle.heads)
 
 
 def _action(bundle: Bundle, variable: str, head: TensorSpec) -> list[str]:
@@ -112,7 +113,7 @@ def _action(bundle: Bundle, variable: str, head: TensorSpec) -> list[str]:
     if plain != head:
         lines.append(f"# deterministic: outputs[{string_literal(plain.name)}]")
     output = f"outputs[{string_literal(head.name)}]"
-    if head.role not in (Role.LOG_PROBS, Role.PROBS):
+    if head.role not in ODDS:
         return [*lines, f"{variable} = {output}"]
     scores = output if head.role is Role.LOG_PROBS else f"np.log({output})"
     ends = [sum(bundle.signature.branches[: i + 1]) for i in range(len(bundle.signature.branches) - 1)]
