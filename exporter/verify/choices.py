@@ -40,20 +40,25 @@ class Choices:
         return [n for n in graph.nodes if n.name in upstream and traits(n).chooses]
 
     def others(self, output: str, feeds: Feeds, tolerance: Tolerance, moved: Moved | None) -> Iterator[np.ndarray]:
-        """Yield what ``output`` is with the next best choice wherever that is as good, then with the one after it."""
+        """Yield what ``output`` is with the best choice, then with the next best wherever that is as good, and so on.
+
+        Nothing where no other choice is as good as the best one.
+        """
         choices, graph = self.behind(output), runnable(self._graph)
         if not choices:
             return
         try:
             ranked = [self._rank(node, feeds, tolerance, moved) for node in choices]
-            for rival in range(1, _RIVALS + 1):
+            if not any(near[..., 1:].any() for _, near in ranked):
+                return
+            for rival in range(_RIVALS + 1):
                 made, changed = dict(feeds), False
                 for node, (order, near) in zip(choices, ranked, strict=True):
                     place = min(rival, order.shape[-1] - 1)
                     chosen = np.where(near[..., place], order[..., place], order[..., 0])
                     changed = changed or bool((chosen != order[..., 0]).any())
                     made[node.name] = chosen.astype(_dtype(node))
-                if not changed:
+                if rival and not changed:
                     return
                 yield run_graph(graph, made, [output])[output]
         except GraphError:  # what does not run explains nothing
@@ -112,18 +117,18 @@ def broken_ties(
 ) -> np.ndarray | None:
     """Return ``expected`` with the ties broken as ``got`` breaks them; None where none is.
 
-    An integer is taken from whichever of ``others`` has it; rows of numbers, which hang together, one by one.
+    An integer is taken from whichever of ``others`` has it, where another has the expected one; rows of numbers, which
+    hang together, one by one.
     """
+    alike = [o for o in others if o.shape == got.shape and o.dtype.kind == expected.dtype.kind]
     made, found = expected, False
-    for other in others:
-        if other.shape != got.shape or other.dtype.kind != expected.dtype.kind:
-            continue
+    for other in alike:
         if expected.dtype.kind == "f":
             off = np.abs(got.astype(np.float64) - other) <= tolerance.atol + tolerance.rtol * np.abs(other)
             same = (off | (got == other)).reshape(len(got), -1).all(axis=1)
             same = same.reshape(-1, *(1,) * (got.ndim - 1)) & np.ones(got.shape, bool)
         else:
-            same = got == other
+            same = (got == other) & np.any([o == expected for o in alike], axis=0)
         differs = same & (made != got)
         found = found or bool(differs.any())
         made = np.where(differs, other, made)

@@ -57,9 +57,12 @@ def test_what_is_not_tied_stays_as_it_is(other: int, tmp_path: Path) -> None:
 
 def test_ties_are_broken_as_an_answer_breaks_them() -> None:
     expected, other = np.array([[0], [1], [2]]), np.array([[5], [1], [7]])
-    made = broken_ties(expected, [other], np.array([[5], [1], [2]]), Tolerance())
+    best = np.array([[0], [1], [2]])
+    made = broken_ties(expected, [best, other], np.array([[5], [1], [2]]), Tolerance())
     assert made is not None and made.tolist() == [[5], [1], [2]]
-    assert broken_ties(expected, [other], np.array([[9], [1], [2]]), Tolerance()) is None
+    assert broken_ties(expected, [best, other], np.array([[9], [1], [2]]), Tolerance()) is None
+    own = broken_ties(np.array([[5], [4], [2]]), [best, other], best, Tolerance())
+    assert own is not None and own.tolist() == [[0], [4], [2]], "the best of the kernels, where the source's is as good"
     rows, others = np.array([[0.0, 1.0], [2.0, 3.0]]), np.array([[5.0, 6.0], [2.0, 3.0]])
     assert broken_ties(rows, [others], np.array([[5.0, 1.0], [2.0, 3.0]]), Tolerance()) is None, "a row as a whole"
     whole = broken_ties(rows, [others], np.array([[5.0, 6.0 + 1e-6], [2.0, 3.0]]), Tolerance())
