@@ -32,7 +32,7 @@ def keep_products_unjoined(graph: Graph, roots: Collection[str] = ()) -> Graph:
     types, readers, editor = infer_types(graph), graph.consumers(), Editor(graph)
     for node in graph.nodes:
         product = sums.get(node.name)
-        editor.keep(node if product is None else _unjoined(editor, node, product, types, readers))
+        editor.keep(node if product is None else _rewrite_sum(editor, node, product, types, readers))
     return editor.prune(roots)
 
 
@@ -42,7 +42,7 @@ def rejoin_biases(graph: Graph) -> Graph:
     for node in graph.nodes:
         bias = _subtracted_bias(graph, node)
         if bias is not None:
-            node = Node(node.name, "BiasAdd", (node.inputs[0], _negated(editor, node, bias)), origin=node.origin)
+            node = Node(node.name, "BiasAdd", (node.inputs[0], _add_negative(editor, node, bias)), origin=node.origin)
         editor.keep(node)
     return editor.graph()
 
@@ -70,7 +70,7 @@ def _product(graph: Graph, node: Node) -> Node | None:
     return None
 
 
-def _unjoined(editor: Editor, node: Node, product: Node, types: Types, readers: Readers) -> Node:
+def _rewrite_sum(editor: Editor, node: Node, product: Node, types: Types, readers: Readers) -> Node:
     if node.attrs.get("data_format", "NHWC") != "NHWC":
         return node
     other = next((r for r in node.inputs if r != product.name), product.name)
@@ -82,7 +82,7 @@ def _unjoined(editor: Editor, node: Node, product: Node, types: Types, readers: 
     plain = node.op == "BiasAdd" or (bias.ndim == 1 and mine is not None and bias.shape == mine[-1:])
     if plain and not _is_misread(editor, node, product, readers):
         return node
-    return Node(node.name, "Sub", (product.name, _negated(editor, node, bias)), origin=node.origin)
+    return Node(node.name, "Sub", (product.name, _add_negative(editor, node, bias)), origin=node.origin)
 
 
 def _is_misread(editor: Editor, node: Node, product: Node, readers: Readers) -> bool:
@@ -99,5 +99,5 @@ def _is_misread(editor: Editor, node: Node, product: Node, readers: Readers) -> 
     return any(op_of(n).remapped == layer for n in following) or any(op_of(n).remapped_behind == layer for n in behind)
 
 
-def _negated(editor: Editor, node: Node, bias: np.ndarray) -> str:
+def _add_negative(editor: Editor, node: Node, bias: np.ndarray) -> str:
     return editor.const(-bias, f"{node.name}/negative")

@@ -31,13 +31,13 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
 
 def frozen_graph(policy: Policy, contract: str = "{}", weights: Storage = "float32") -> Pieces:
     """The policy's GraphDef with its contract; without one, as the numpy reference needs it."""
-    return serialised(policy.graph, contract, weights)
+    return serialise_graph(policy.graph, contract, weights)
 
 
-def serialised(graph: Graph, contract: str, weights: Storage) -> Pieces:
+def serialise_graph(graph: Graph, contract: str, weights: Storage) -> Pieces:
     """A graph as a GraphDef with the contract, made once."""
     made: dict[Any, Pieces] = graph.cache
-    key = serialised, contract, weights
+    key = serialise_graph, contract, weights
     if key not in made:
         stored = with_contract(store_compactly(graph, weights), contract)
         detached = Detached.of(stored.values())

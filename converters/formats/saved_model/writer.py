@@ -19,7 +19,7 @@ from converters.files.external_data import Detached, is_readable
 from converters.formats.bundle.embed import with_contract
 from converters.formats.format import WriteOptions
 from converters.formats.frozen_graph.encode import encode
-from converters.formats.frozen_graph.writer import serialised
+from converters.formats.frozen_graph.writer import serialise_graph
 from converters.formats.saved_model.variables import files_of
 from converters.graph.nodes import node_of
 from converters.graph.ops.samplers import SAMPLERS
@@ -77,7 +77,7 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
     version = schema.SavedModel(saved_model_schema_version=1)
     meta = Pieces(
         schema.serialise(about),
-        schema.field(2, serialised(graph, options.contract, options.weights)),
+        schema.field(2, serialise_graph(graph, options.contract, options.weights)),
         schema.serialise(signed),
     )
     whole = Pieces(schema.serialise(version), schema.field(2, meta))
