@@ -73,11 +73,6 @@ def _narrow(artefact: Artefact) -> None:
     artefact.retype_indices("deterministic_action", np.int32)
 
 
-def _not_read(artefact: Artefact) -> None:
-    zero = artefact.add_constant("fault/zero", np.array(0, np.float32))
-    artefact.redirect("recurrent_in", artefact.insert("fault/forgotten", "Mul", ["recurrent_in", zero]))
-
-
 def _halves_swapped(artefact: Artefact) -> None:
     c, h, *axis = artefact.reads("recurrent_out")
     artefact.rewire("recurrent_out", [h, c, *axis])
@@ -170,15 +165,6 @@ FAULTS = (
         refused={"bytes": "has 'deterministic_action' as int32"},
     ),
     Fault(
-        "a memory that is not read",
-        "recurrent",
-        _not_read,
-        "recurrent_out",
-        ("lstm/strided_slice", "lstm/strided_slice_1"),
-        "StridedSlice",
-        "rollout",
-    ),
-    Fault(
         "a memory that is not fed back",
         "recurrent",
         lambda artefact: artefact.become("recurrent_out", "Identity", ["recurrent_in"]),
@@ -196,7 +182,6 @@ FAULTS = (
         "ConcatV2",
     ),
     Fault("swish replaced by relu", "continuous", _relu, "action", ("main_graph_0/hidden_0/Mul",), "Mul"),
-    Fault("a NaN", "continuous", _weight("dense/bias/read", (0,), np.nan), "action", ("dense/bias/read",), "Const"),
     Fault(
         "a sampler that prefers a class",
         "sampled",

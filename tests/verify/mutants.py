@@ -26,7 +26,8 @@ _WORDS = ("verdict", "findings", "report", "npy", "plays", "options", "session",
 #: Tests that start no runtime, the cheapest first.
 TESTS = (
     *("tests/verify/test_bounds.py", "tests/exporter/test_comparison.py", "tests/verify"),
-    *("tests/compare/test_ports.py", "tests/compare/test_budget.py", "tests/exporter/test_bisection.py"),
+    *("tests/faults/test_kept_actions.py::test_columns_that_a_sampler_decides", "tests/compare/test_ports.py"),
+    *("tests/compare/test_budget.py", "tests/exporter/test_bisection.py"),
     *("tests/exporter/test_verification.py", "tests/exporter/test_what_is_compared.py"),
 )
 SECONDS = 240

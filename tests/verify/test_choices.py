@@ -1,4 +1,4 @@
-"""Choices among scores, and outputs that are drawn in part: which elements another answer is as right for."""
+"""Choices among scores: where another one is as right."""
 
 from __future__ import annotations
 
