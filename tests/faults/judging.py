@@ -145,7 +145,13 @@ class Subject:
         return compare_artefacts(self.source, [file], options, pool=self.pool)
 
     def _is_located(self, report: ParityReport, fault: Fault) -> bool:
-        """Whether a finding names the tensor or one that reads it, or says in words what is wrong with the output."""
+        """Whether a finding names the tensor or one that reads it, or says in words what is wrong with the output.
+
+        Of a file's text: whether it names the function, or the entry of the metadata.
+        """
+        if fault.edit is not None:
+            name = fault.kind.removeprefix("metadata: ").partition(" ")[0].rstrip(":")
+            return any(name in f"{f.output} {f.worst_input} {f.reason}" for f in report.failures)
         graph = self.job.policy.graph
         near = {fault.tensor, *(n.name for n in graph.nodes if fault.tensor in map(node_of, n.inputs))}
         outputs = {o for o, t in self.job.policy.fetches.items() if node_of(t) in near}
