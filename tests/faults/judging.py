@@ -205,17 +205,20 @@ def planted(form: str, fault: Fault | None) -> Iterator[None]:
     """Have a format's artefacts written with the fault."""
     right = job._artifact
 
-    def wrong(kind: Format, policy: Policy, how: WriteOptions) -> Artifact:
+    def spoilt(kind: Format, policy: Policy, how: WriteOptions) -> Artifact:
         if fault is None or kind.key != form:
             return right(kind, policy, how)
-        if fault.policy is not None:
-            return right(kind, replace(policy, graph=fault.policy.graph), how)
         made = right(kind, policy, how)
+        if fault.policy is not None:
+            wrong = right(kind, replace(policy, graph=fault.policy.graph), how)
+            if all(wrong.files[p].to_bytes() == made.files[p].to_bytes() for p in made.files):
+                raise UnsupportedOpError("the file has nothing of it")
+            return wrong
         assert fault.edit is not None
         content = made.files[made.main].to_bytes()
         changed = fault.edit(content)
         assert changed != content, "the fault is not in the file"
         return replace(made, files={**made.files, made.main: Pieces(changed)})
 
-    with mock.patch.object(job, "_artifact", wrong):
+    with mock.patch.object(job, "_artifact", spoilt):
         yield
