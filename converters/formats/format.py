@@ -166,7 +166,7 @@ class Format(Struct, frozen=True, eq=False, kw_only=True):
       what the wanted nodes (of a graph that any node can be asked of) or signatures need, no op that does more than
       compute, no file from elsewhere.
     - ``held`` gives the contract that an artefact of ours embeds, as text or as JSON's values (None: it has none).
-      ``misstated`` says what it states of a policy's interface beside that contract otherwise than a signature does;
+      ``misstatement`` says what it states of a policy's interface beside that contract otherwise than a signature does;
       None where it is the same.
     - ``ports`` reads what an artefact takes and gives. ``runtimes`` are those that run it, in the order of reports;
       ``signatures``: it is called by signature; ``predicts``: people call it through ``predict``, for all outputs at
@@ -197,7 +197,7 @@ class Format(Struct, frozen=True, eq=False, kw_only=True):
     beside: str = ""
     default: bool = False
     held: Callable[[Path], Any] | None = None
-    misstated: Callable[[Path, PolicySignature], str | None] | None = None
+    misstatement: Callable[[Path, PolicySignature], str | None] | None = None
     ports: Callable[[Path], Ports] | None = None
     vetted: Callable[[Path, Sequence[str], Path], Path] | None = None
     runtimes: tuple[str, ...] = ()

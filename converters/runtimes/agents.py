@@ -41,20 +41,20 @@ class Drive(Struct, frozen=True):
         return convert(request["drive"], cls) if "drive" in request else None
 
 
-def shown(header: Header) -> tuple[Field, ...]:
+def fields_of_agent(header: Header) -> tuple[Field, ...]:
     """What is seen of an agent after a decision: its outputs, its noise; its state last, under the output's name."""
     return (*header.outputs, *header.noise, *((header.next_state,) if header.state and header.next_state else ()))
 
 
-def sized(header: Header) -> tuple[Field, ...]:
+def fields_with_size(header: Header) -> tuple[Field, ...]:
     """The members of which a file has the sizes."""
     return (*header.fed, *header.outputs)
 
 
-def fetched(header: Header, fetch: Iterable[str], every: Sequence[np.ndarray]) -> Tensors:
-    """What is asked for of arrays [repeat, agents, size] in the order of ``shown``; the last decision without EVERY."""
+def answers_of(header: Header, fetch: Iterable[str], every: Sequence[np.ndarray]) -> Tensors:
+    """Return what is fetched of arrays [repeat, agents, size], a field each; the last decision without EVERY."""
     found = dict[str, np.ndarray]()
-    for f, array in zip(shown(header), every, strict=True):
+    for f, array in zip(fields_of_agent(header), every, strict=True):
         array = array.astype(f.spec.dtype)
         found[f.spec.name], found[f"{EVERY}{f.spec.name}"] = array[-1], array
     return {name: found[name] for name in fetch if name in found}

@@ -112,7 +112,10 @@ def verify_folder(
         assert form.held is not None
         with naming(found.path(form)):
             found.verify_contract(form.held(found.path(form)))
-            if form.misstated is not None and (what := form.misstated(found.path(form), found.signature)) is not None:
+            if (
+                form.misstatement is not None
+                and (what := form.misstatement(found.path(form), found.signature)) is not None
+            ):
                 raise unfit(found.path(form), what, f"it is not what {POLICY} says of the interface")
     own = case.judge or FROZEN_GRAPH
     if case.judge is None and case.made_for is None and given.again is None:

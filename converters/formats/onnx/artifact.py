@@ -53,7 +53,7 @@ def stated_metadata(signature: PolicySignature) -> Mapping[str, str]:
     return {} if interface is None or interface.baked else interface.metadata
 
 
-def misstated(path: Path, signature: PolicySignature) -> str | None:
+def misstatement(path: Path, signature: PolicySignature) -> str | None:
     """The key of a model's metadata that is not what the source stated; None where all are. Raises SourceError."""
     model = decode_model(read_bytes(path), Detached())
     found = {str(p.key): str(p.value) for p in model.metadata_props if p.key not in (EMBEDDED, TENSORS_KEY)}

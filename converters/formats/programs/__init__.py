@@ -29,7 +29,7 @@ def program_format(
         beside=WEIGHTS_FILE,
         narrow=True,
         held=_artifact.held,
-        misstated=_artifact.misstated,
+        misstatement=_artifact.misstatement,
         ports=_artifact.ports,
         vetted=_artifact.vetted,
         answers=_members.answers,

@@ -28,7 +28,7 @@ def held(path: Path) -> str | None:
     return rest.partition(b"\n*/")[0].decode("ascii", "replace") if found else None
 
 
-def misstated(path: Path, signature: PolicySignature) -> str | None:
+def misstatement(path: Path, signature: PolicySignature) -> str | None:
     """The line of a file's comment on its numbers that a signature does not say; None where there is none."""
     comment = read_bytes(path).partition(_MARK)[0].decode("ascii", "replace")
     found = [line for line in comment.splitlines() if line.startswith(LINE)]

@@ -25,7 +25,16 @@ from converters.files.children.frames import Tensors
 from converters.formats.programs.artifact import contract_held
 from converters.formats.programs.members import Header, header_of
 from converters.formats.programs.weights import weights_name
-from converters.runtimes.agents import AGENTS, CHOSEN, SIZES, UNUSUAL, Drive, fetched, shown, sized
+from converters.runtimes.agents import (
+    AGENTS,
+    CHOSEN,
+    SIZES,
+    UNUSUAL,
+    Drive,
+    answers_of,
+    fields_of_agent,
+    fields_with_size,
+)
 from converters.runtimes.base import REFUSED
 from converters.runtimes.rows import OUTSIDE, as_declared, fed_rows, row_count
 from signatures.code import CodeOptions
@@ -86,7 +95,7 @@ def _agents_driver(header: Header, code: CodeOptions, branches: Sequence[int]) -
     take = " ".join(f"memcpy({to}, {source}{to}, sizeof {to});" for to, source in fed)
     place = f"(size_t)(turn * {AGENTS} + i) * sizeof "
     tell = " ".join(f"memcpy((char *)out[{n}] + {place}{at}, {at}, sizeof {at});" for n, at in enumerate(members))
-    sizes = "".join(f"{p}_size_{f.name}, " for f in sized(header))
+    sizes = "".join(f"{p}_size_{f.name}, " for f in fields_with_size(header))
     functions = {
         "void judge_begin(uint64_t seed)": [f"{each}{p}_reset(&memories[i], seed + (uint64_t)i);"],
         "int judge_act(int repeat, const void *const *in, void *const *out)": [
@@ -110,7 +119,8 @@ def _agents_driver(header: Header, code: CodeOptions, branches: Sequence[int]) -
             f"    static const int32_t branches[] = {f'{p.upper()}_BRANCHES' if branches else '{0}'};",
             f"{each}counts[i] = unusual[i];\n    memcpy(sizes, known, sizeof known);",
             f"    for (int i = 0; i < {len(branches)} && i < (int)(sizeof branches / 4); i++)",
-            f"        sizes[{len(sized(header))} + i] = branches[i];\n    return (int)(sizeof branches / 4);",
+            f"        sizes[{len(fields_with_size(header))} + i] = branches[i];",
+            "    return (int)(sizeof branches / 4);",
         ],
     }
     text = "\n".join("\n".join([f"{head};", head, "{", *body, "}"]) for head, body in functions.items())
@@ -151,10 +161,13 @@ class _Library:
     def _drive(self, drive: Drive, feeds: Tensors, fetch: Sequence[str]) -> Tensors:
         header, size = self.header, (drive.repeat, AGENTS)
         fed = [fed_rows(f, feeds.get(f.spec.name), AGENTS, _C_DTYPES) for f in header.inputs]
-        made = [np.zeros((*size, f.size), _C_DTYPES.get(f.spec.dtype, f.spec.dtype)) for f in shown(header)]
+        made = [np.zeros((*size, f.size), _C_DTYPES.get(f.spec.dtype, f.spec.dtype)) for f in fields_of_agent(header)]
         pointers = [(ctypes.c_void_p * max(1, len(a)))(*(x.ctypes.data for x in a)) for a in (fed, made)]
         classes = np.zeros((AGENTS, drive.choose, len(self.branches)), np.int32)
-        sizes, counts = np.zeros(len(sized(header)) + len(self.branches) + 1, np.int32), np.zeros(AGENTS, np.int32)
+        sizes, counts = (
+            np.zeros(len(fields_with_size(header)) + len(self.branches) + 1, np.int32),
+            np.zeros(AGENTS, np.int32),
+        )
         if drive.seed is not None:
             self.library.judge_begin(ctypes.c_uint64(drive.seed))
         if without := self.library.judge_act(drive.repeat, *pointers):
@@ -162,7 +175,7 @@ class _Library:
         self.library.judge_choose(drive.choose, ctypes.c_void_p(classes.ctypes.data))
         count = self.library.judge_sizes(*(ctypes.c_void_p(a.ctypes.data) for a in (sizes, counts)))
         sizes[-1] = count if self.branches else 0
-        return fetched(header, fetch, made) | {CHOSEN: classes, SIZES: sizes, UNUSUAL: counts}
+        return answers_of(header, fetch, made) | {CHOSEN: classes, SIZES: sizes, UNUSUAL: counts}
 
 
 class _Builder:

@@ -25,7 +25,16 @@ from converters.files.children.frames import Tensors
 from converters.formats.programs.artifact import contract_held
 from converters.formats.programs.members import Field, Header, header_of
 from converters.formats.programs.weights import weights_name
-from converters.runtimes.agents import AGENTS, CHOSEN, SIZES, UNUSUAL, Drive, fetched, shown, sized
+from converters.runtimes.agents import (
+    AGENTS,
+    CHOSEN,
+    SIZES,
+    UNUSUAL,
+    Drive,
+    answers_of,
+    fields_of_agent,
+    fields_with_size,
+)
 from converters.runtimes.base import REFUSED
 from converters.runtimes.rows import OUTSIDE, as_declared, fed_rows, row_count
 from signatures.code import CodeOptions
@@ -109,7 +118,7 @@ def _agents_driver(header: Header, code: CodeOptions, branches: Sequence[int]) -
             (f"agent.{state.name}, 0, kept[row], 0", f"kept[row], 0, agent.{state.name}, 0") if state else ("", "")
         )
     )
-    sizes = "".join(f" writer.Write({kind}.Sizes.{f.name});" for f in sized(header))
+    sizes = "".join(f" writer.Write({kind}.Sizes.{f.name});" for f in fields_with_size(header))
     agent, each = f"{kind} agent = agents[row];", f"for (int row = 0; row < {AGENTS}; row++)"
     choose = (
         f"""var classes = new int[{len(branches)}];
@@ -143,7 +152,7 @@ def _agents_driver(header: Header, code: CodeOptions, branches: Sequence[int]) -
             kept[row] = new byte[{size}];
             {keep}
         }}
-        var output = new byte[{_bytes(shown(header))}];
+        var output = new byte[{_bytes(fields_of_agent(header))}];
         for (int turn = 0; turn < repeat; turn++) {{
             {each} {{
                 {agent}
@@ -152,7 +161,7 @@ def _agents_driver(header: Header, code: CodeOptions, branches: Sequence[int]) -
             }}
             {each} {{
                 {agent}
-                {_copies(header, shown(header), False)}
+                {_copies(header, fields_of_agent(header), False)}
                 writer.Write(output);
             }}
         }}
@@ -242,14 +251,14 @@ class _Program:
         pipe.write(struct.pack("<i?Qii", -1, drive.seed is not None, drive.seed or 0, drive.repeat, drive.choose))
         pipe.write(np.concatenate(fed, axis=1).tobytes() if fed else b"")
         pipe.flush()
-        made = np.frombuffer(self._read(count * _bytes(shown(header))), np.uint8).reshape(count, -1)
+        made = np.frombuffer(self._read(count * _bytes(fields_of_agent(header))), np.uint8).reshape(count, -1)
         if without := self._integers(1)[0]:
             raise ValueError(OUTSIDE.format(without))
-        every = [a.reshape(drive.repeat, AGENTS, -1) for _, a in _cut(shown(header), made)]
+        every = [a.reshape(drive.repeat, AGENTS, -1) for _, a in _cut(fields_of_agent(header), made)]
         branches = len(self.branches)
         classes = self._integers(AGENTS * drive.choose * branches).reshape(AGENTS, drive.choose, branches)
-        sizes, unusual = self._integers(len(sized(header)) + branches + 1), self._integers(AGENTS)
-        return fetched(header, fetch, every) | {CHOSEN: classes, SIZES: sizes, UNUSUAL: unusual}
+        sizes, unusual = self._integers(len(fields_with_size(header)) + branches + 1), self._integers(AGENTS)
+        return answers_of(header, fetch, every) | {CHOSEN: classes, SIZES: sizes, UNUSUAL: unusual}
 
     def _integers(self, count: int) -> np.ndarray:
         return np.frombuffer(self._read(4 * count), "<i4")

@@ -16,7 +16,7 @@ from msgspec.structs import replace
 from converters.formats.programs.artifact import contract_held
 from converters.formats.programs.members import Header, header_of
 from converters.formats.registry import WRITTEN
-from converters.runtimes.agents import AGENTS, CHOSEN, EVERY, SIZES, UNUSUAL, shown, sized
+from converters.runtimes.agents import AGENTS, CHOSEN, EVERY, SIZES, UNUSUAL, fields_of_agent, fields_with_size
 from exporter.verify.checks.generators import DEPENDENT, likely, wrong_classes
 from exporter.verify.checks.numbers import rank
 from exporter.verify.difference import Difference, wrong
@@ -115,7 +115,7 @@ class _Played:
     def _step(self, where: str, feeds: Feeds, state: Feeds, *, seed: bool, repeat: int, choose: int) -> _Step:
         """A decision of each agent, several times from the same state."""
         header, outer = self.header, self.trial.signature
-        names = [f.spec.name for f in shown(header)]
+        names = [f.spec.name for f in fields_of_agent(header)]
         own = {self._own(n): a for n, a in feeds.items()}
         answer = self.participant.model.run(
             {f.spec.name: own[f.spec.name] for f in header.inputs},
@@ -128,7 +128,7 @@ class _Played:
                 "state": [header.state.spec.name, header.next_state.spec.name]
                 if header.state and header.next_state
                 else None,
-                "sized": [f.spec.name for f in sized(header)],
+                "sized": [f.spec.name for f in fields_with_size(header)],
             },
         )
         step = _Step(Case(where, {}, AGENTS), answer, {})
@@ -141,7 +141,7 @@ class _Played:
     def constants(self) -> Iterator[Finding]:
         """The sizes and branches that the file states, and how many numbers it calls unusual."""
         branches = self.signature.branches
-        stated = {f"the size of {f.name}": f.size for f in sized(self.header)}
+        stated = {f"the size of {f.name}": f.size for f in fields_with_size(self.header)}
         stated |= {f"the actions of branch {i}": n for i, n in enumerate(branches, 1)} | {"branches": len(branches)}
         found = self.begun.answer[SIZES].tolist()
         for (what, right), got in zip(stated.items(), found, strict=True):
