@@ -123,7 +123,7 @@ def inner(loaded: Loaded) -> Iterator[InnerTensors]:
     samplers, turns = _samplers(model, subgraph), itertools.count()
 
     @contextmanager
-    def opened(draws: Mapping[str, int], fetch: Sequence[str]) -> Iterator[RunAll]:
+    def open_copy(draws: Mapping[str, int], fetch: Sequence[str]) -> Iterator[RunAll]:
         drawn = {numbers[name] for name in draws}
         wider = {
             **subgraph,
@@ -152,12 +152,12 @@ def inner(loaded: Loaded) -> Iterator[InnerTensors]:
         others = [n for n in fetch if n not in values and n not in wanted]
         values |= {n: _constant(model, tensors[kept.get(numbers[n], numbers[n])]) for n in others}
         if wanted:
-            with opened({s.tensor: feeds[s.tensor].ndim for s in samplers if s.tensor in feeds}, wanted) as run_all:
+            with open_copy({s.tensor: feeds[s.tensor].ndim for s in samplers if s.tensor in feeds}, wanted) as run_all:
                 values.update(run_all([feeds], wanted)[0])
         return values
 
     with scratch_folder() as folder:
-        yield InnerTensors(view, run, samplers=samplers, opened=opened)
+        yield InnerTensors(view, run, samplers=samplers, opened=open_copy)
 
 
 def _samplers(model: Table, subgraph: Table) -> tuple[Sampler, ...]:

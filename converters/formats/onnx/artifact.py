@@ -85,7 +85,7 @@ def _inner(loaded: Loaded) -> Iterator[InnerTensors]:
     samplers = samplers_of(model)
 
     @contextmanager
-    def opened(draws: Mapping[str, int], fetch: Sequence[str]) -> Iterator[RunAll]:
+    def open_copy(draws: Mapping[str, int], fetch: Sequence[str]) -> Iterator[RunAll]:
         open_model = type(model)()
         open_model.CopyFrom(model)
         if draws:
@@ -110,11 +110,11 @@ def _inner(loaded: Loaded) -> Iterator[InnerTensors]:
         wanted = [name for name in fetch if name in made and name not in values]
         if wanted:
             draws = {s.tensor: feeds[s.tensor].ndim for s in samplers if s.tensor in feeds}
-            with opened(draws, wanted) as run_all:
+            with open_copy(draws, wanted) as run_all:
                 values.update(run_all([feeds], wanted)[0])
         return values
 
-    yield InnerTensors(view, run, samplers=samplers, opened=opened)
+    yield InnerTensors(view, run, samplers=samplers, opened=open_copy)
 
 
 def origins(path: Path) -> Mapping[str, str]:

@@ -44,7 +44,7 @@ def inner(loaded: Loaded) -> AbstractContextManager[InnerTensors]:
     samplers = samplers_of({n["name"]: (n["op"], n.get("input", ())) for n in nodes}, "int32")
 
     @contextlib.contextmanager
-    def opened(draws: Mapping[str, int], fetch: Sequence[str]) -> Iterator[RunAll]:
+    def open_copy(draws: Mapping[str, int], fetch: Sequence[str]) -> Iterator[RunAll]:
         """A copy with inputs in place of samplers: TensorFlow.js takes no classes for the output of one."""
         if not draws:
             yield loaded.run_all
@@ -62,7 +62,7 @@ def inner(loaded: Loaded) -> AbstractContextManager[InnerTensors]:
                 yield one.run_all
 
     view = own_names(n["name"] for n in nodes)
-    return contextlib.nullcontext(InnerTensors(view, loaded.run, samplers=samplers, opened=opened))
+    return contextlib.nullcontext(InnerTensors(view, loaded.run, samplers=samplers, opened=open_copy))
 
 
 #: What the official converter makes of other ops, and what TensorFlow 2 writes loops with: in memory, all of them.

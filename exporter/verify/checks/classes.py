@@ -43,7 +43,7 @@ def classes(trial: Trial, participant: Participant, names: Sequence[str]) -> Ite
         single = one_row_at_a_time(participant)
         wanted = FEW if single or has_pictures(trial) else DRAWS
         count = trial.allowance(participant, "draws").at_most(wanted, "draws")
-        known = [(c, r) for c, r in _decided(trial, scores.name) if not np.isnan(odds[id(c)][r]).any()]
+        known = [(c, r) for c, r in _decided_places(trial, scores.name) if not np.isnan(odds[id(c)][r]).any()]
         if not count or not known:
             continue
         rows = in_turn(trial, known, count)
@@ -55,7 +55,7 @@ def classes(trial: Trial, participant: Participant, names: Sequence[str]) -> Ite
         yield trial.finding(Draws, participant, name, difference, MIXED, bisection=begins)
 
 
-def _decided(trial: Trial, scores: str) -> list[Place]:
+def _decided_places(trial: Trial, scores: str) -> list[Place]:
     """The places at which no choice that the odds hang on is open: another is right there too."""
     found = places(trial)
     if not trial.choices.behind(scores):

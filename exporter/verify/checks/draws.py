@@ -50,7 +50,7 @@ def draws(trial: Trial, participant: Participant) -> Iterator[Finding]:
     poor = _POOR.get(participant.runtime)
     if poor:
         trial.remarks[f"{participant.runtime}: only what is made of its draws is compared, as {poor}"] = None
-    repeated = {} if poor else _repeated(trial, participant, names)
+    repeated = {} if poor else _repetitions(trial, participant, names)
     for name, reason in repeated.items():
         yield trial.finding(Draws, participant, name, wrong(reason), MIXED)
     names = [n for n in names if n not in repeated]
@@ -103,7 +103,7 @@ def _findings_of(trial: Trial, cut: Cut, way: CutArtefact, names: Sequence[str])
     failed = {f.output for f in found if not f.passed}
     if made.runtime in _POOR:
         return found
-    return [*found, *(f for f in _generated(trial, cut, way, names) if f.output not in failed)]
+    return [*found, *(f for f in _sampler_findings(trial, cut, way, names) if f.output not in failed)]
 
 
 def _by_output(cut: Cut, names: Sequence[str], found: Iterator[Finding]) -> list[Finding]:
@@ -121,7 +121,7 @@ def _by_output(cut: Cut, names: Sequence[str], found: Iterator[Finding]) -> list
     return list(worst.values())
 
 
-def _generated(trial: Trial, cut: Cut, way: CutArtefact, names: Sequence[str]) -> Iterator[Finding]:
+def _sampler_findings(trial: Trial, cut: Cut, way: CutArtefact, names: Sequence[str]) -> Iterator[Finding]:
     """How well each sampler's draws fit what it draws from, for the outputs that hang on it."""
     participant, samplers = way.participant, list(way.own.values())
     single = one_row_at_a_time(participant) and any(s.scores is not None for s in samplers)
@@ -154,7 +154,7 @@ def _draws_finding(
 # ---- draws that come again
 
 
-def _repeated(trial: Trial, participant: Participant, names: Sequence[str]) -> dict[str, str]:
+def _repetitions(trial: Trial, participant: Participant, names: Sequence[str]) -> dict[str, str]:
     """Output → what is wrong with draws that come again: after every start, or in every call."""
     if participant.runtime == "numpy":  # its child draws from one seed
         return {}
@@ -164,11 +164,11 @@ def _repeated(trial: Trial, participant: Participant, names: Sequence[str]) -> d
         return {}
     rows = in_turn(trial, places(trial), count)
     pair = [rows_at(trial, rows, single=single, run=run) for run in range(2)]
-    one, other = (_joined(trial.reference.run(inputs, names)) for inputs in pair)
+    one, other = (_join_rows(trial.reference.run(inputs, names)) for inputs in pair)
     telling = {n: (one[n] != other[n]).sum(axis=0) >= DIFFERING for n in names}
     if not any(t.any() for t in telling.values()):
         return {}
-    one, other = (_joined(participant.run(pair[0], names)) for _ in range(2))
+    one, other = (_join_rows(participant.run(pair[0], names)) for _ in range(2))
     called = _alike(one, other, telling)
     said = {n: CALLED_ALIKE + _which(trial, n, columns) for n, columns in called.items()}
     starts = _starts(trial, participant, pair[0], names, telling)
@@ -191,21 +191,21 @@ def _starts(
     if participant.again is None or participant.path is None or (apart and participant.path in trial.started):
         return {}
     trial.started.add(participant.path)
-    one = _started(participant, trial.pool, inputs, names)
+    one = _start_again(participant, trial.pool, inputs, names)
     if not apart:
-        return _alike(one, _started(participant, trial.pool, inputs, names), telling)
+        return _alike(one, _start_again(participant, trial.pool, inputs, names), telling)
     with RuntimePool() as second:
-        return _alike(one, _started(participant, second, inputs, names), telling)
+        return _alike(one, _start_again(participant, second, inputs, names), telling)
 
 
-def _started(participant: Participant, pool: RuntimePool, inputs: Sequence[Feeds], names: Sequence[str]) -> Arrays:
+def _start_again(participant: Participant, pool: RuntimePool, inputs: Sequence[Feeds], names: Sequence[str]) -> Arrays:
     assert participant.again is not None
     model, run = participant.again(pool, True)
     with model:
-        return _joined(run(inputs, names))
+        return _join_rows(run(inputs, names))
 
 
-def _joined(answers: Sequence[Mapping[str, np.ndarray]]) -> Arrays:
+def _join_rows(answers: Sequence[Mapping[str, np.ndarray]]) -> Arrays:
     """[rows, columns] of each output."""
     together = {n: np.concatenate([a[n] for a in answers]) for n in answers[0]}
     return {n: a.reshape(len(a), -1) for n, a in together.items()}
