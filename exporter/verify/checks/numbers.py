@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from converters.formats.registry import narrows
 from exporter.verify.difference import Difference, add_histograms, wrong
-from exporter.verify.excuses import add_forgiven
+from exporter.verify.excuses import BOTH_NAN, add_forgiven
 from exporter.verify.findings import Bisection, Finding, Numbers, Shape, undecided_finding
 from exporter.verify.participants import Feeds, Participant
 from exporter.verify.trial import Trial
@@ -71,7 +71,7 @@ def _mostly_open(participant: Participant, name: str, ordinary: Sequence[Differe
     """A finding where rules that hold an answer to no number forgave half the elements at ordinary inputs."""
     forgiven = [f for f in add_forgiven(d.forgiven for d in ordinary) if f.excuse.leaves_open]
     count, left = sum(d.elements for d in ordinary), sum(f.elements for f in forgiven)
-    if forgiven and 2 * left >= count:
+    if forgiven and 2 * left >= count and (left < count or forgiven[0].excuse is not BOTH_NAN):  # else: check_defined
         titles = " and ".join(f.excuse.title for f in forgiven)
         reason = f"{left:,} of {count:,} elements of {name} were left open at ordinary inputs: {titles}"
         yield undecided_finding(participant.name, participant.runtime, name, reason)
