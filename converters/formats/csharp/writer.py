@@ -96,7 +96,7 @@ def _text(file: str, plan: Plan) -> str:
     methods = [
         *_beginning(name, plan, draws=draws),
         "    /// <summary>Decides: draws the noise where there is some, then computes.</summary>\n"
-        + _copied(plan)
+        + _copy_remark(plan)
         + "    public void Act()\n    {\n"
         + "".join(f"        _Normal(this.{f.name});\n" for f in header.noise)
         + "        Compute();\n    }",
@@ -165,7 +165,7 @@ def _beginning(name: str, plan: Plan, *, draws: bool) -> list[str]:
     ]
 
 
-def _copied(plan: Plan) -> str:
+def _copy_remark(plan: Plan) -> str:
     """What is left to the caller of ``Act``."""
     names = ", ".join(f.name for f in plan.header.inputs if f.spec.role is Role.PREV_ACTION)
     return f"    /// <remarks>It does not change {names}: copy there what was done.</remarks>\n" if names else ""

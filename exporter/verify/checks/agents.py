@@ -78,7 +78,7 @@ class _Played:
         for number, feeds in enumerate(self.observed):
             where = f"act, step {number + 1} of {len(self.observed)}"
             self.steps.append(self._step(where, feeds, state, seed=not number, repeat=self.repeat, choose=DRAWS))
-            state = self.trial.signature.fed_back({n: self._answer(self.steps[-1], n) for n in self._kept})
+            state = self.trial.signature.fed_back({n: self._answer(self.steps[-1], n) for n in self._returned_outputs})
         self.again = self._step("an episode begins", alike, {}, seed=True, repeat=STARTS, choose=STARTS)
         made = trial.reference.answers([s.case.feeds for s in (*self.steps, self.begun)])
         *self.steps, self.begun = [replace(s, expected=e) for s, e in zip((*self.steps, self.begun), made, strict=True)]
@@ -86,7 +86,7 @@ class _Played:
     # ------------------------------------------------------------------ what is played
 
     @property
-    def _kept(self) -> list[str]:
+    def _returned_outputs(self) -> list[str]:
         """The outputs that the program feeds back by itself."""
         given = self.header.next_state.spec.name if self.header.state and self.header.next_state else None
         return [out for _, out in self.trial.signature.recurrences if self._own(out) == given]
@@ -177,13 +177,13 @@ class _Played:
                 yield self._finding(Acting, name.removeprefix(EVERY), wrong(ANEW), self.begun.case.name)
                 return
         alike = [f.spec.name for f in self.header.noise if _equal(self.begun.answer[f"{EVERY}{f.spec.name}"], axis=1)]
-        alike += [CHOSEN] if self.chosen and _equal(self.begun.answer[CHOSEN], axis=0) and self._told() else []
+        alike += [CHOSEN] if self.chosen and _equal(self.begun.answer[CHOSEN], axis=0) and self._would_differ() else []
         sampled = [n for n in self.drawn if _equal(self.begun.answer[f"{EVERY}{self._own(n)}"], axis=1)]
-        alike += sampled if self._told() else []
+        alike += sampled if self._would_differ() else []
         for name in alike:
             yield self._finding(Draws, name, wrong(ALIKE), self.begun.case.name)
 
-    def _told(self) -> bool:
+    def _would_differ(self) -> bool:
         """Whether draws of classes would differ if they were independent."""
         scores = self.trial.signature.log_probs
         if scores is None or scores.name not in self.begun.expected:
