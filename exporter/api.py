@@ -31,6 +31,7 @@ class _ReadKeywords(TypedDict, total=False):
     goals: Sequence[int]
     activation: str | None
     script: str | None
+    repair: str | None
     normaliser: Path | str | None
     interface: Path | str | None
     trust_source: bool

@@ -35,6 +35,8 @@ class ReadOptions(Struct, frozen=True, kw_only=True):
     activation: str | None = None
     #: Script that saved a bare ``.pt``, where the names of its layers fit several: ``ppo-pytorch-continuous``.
     script: str | None = None
+    #: Known fault of an ONNX model's exporter that is mended: ``gru-reset``.
+    repair: str | None = None
     #: File with the statistics that a model of Stable-Baselines3 was trained behind (default: the one next to it), or
     #: ``"none"`` to leave them out.
     normaliser: Path | str | None = None
@@ -55,6 +57,7 @@ class ReadOptions(Struct, frozen=True, kw_only=True):
             goals=tuple(self.goals),
             activation=self.activation,
             script=self.script,
+            repair=self.repair,
             normaliser=normaliser,
             interface=interface,
         )

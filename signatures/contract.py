@@ -74,6 +74,7 @@ class Origin(Record, frozen=True):
     - ``goals``: which of the sensors are goals, by their place.
     - ``activation``: activation between layers (--activation).
     - ``script``: script that saved the weights (--script).
+    - ``repair``: fault of the exporter that was mended (--repair).
     - ``normaliser``: file of the observations' statistics (--normaliser), or none.
     """
 
@@ -85,6 +86,7 @@ class Origin(Record, frozen=True):
     goals: Annotated[tuple[Count, ...], Meta(max_length=1000)] = ()
     activation: Text | None = None
     script: Text | None = None
+    repair: Text | None = None
     normaliser: Text | None = None
 
 

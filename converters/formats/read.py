@@ -28,6 +28,7 @@ _TAKEN = (
     ("sensors", "a .pt"),
     ("activation", "a state dictionary"),
     ("script", "a state dictionary"),
+    ("repair", "an ONNX model"),
     ("normaliser", "a saved model of Stable-Baselines3"),
 )
 

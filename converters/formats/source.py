@@ -103,6 +103,7 @@ class ReadOptions(Struct, frozen=True):
     - ``normaliser``: the file with the statistics that observations were normalised by (None: the one beside the
       source; ``NO_NORMALISER``: they are left out).
     - ``script``: which script saved a state dictionary.
+    - ``repair``: which fault of an ONNX model's exporter is mended.
     - ``interface``: the file that states the interface (None: those beside the source; "none": none).
     """
 
@@ -114,3 +115,4 @@ class ReadOptions(Struct, frozen=True):
     normaliser: str | None = None
     interface: str | None = None
     script: str | None = None
+    repair: str | None = None

@@ -48,13 +48,13 @@ GROUPS = {
     ),
     "How to read the source": (
         *("source", "step", "brain", "inputs", "outputs", "values", "mapped", "sensors", "activation", "script"),
-        *("normaliser", "interface", "trust_source"),
+        *("repair", "normaliser", "interface", "trust_source"),
     ),
     "How to read the candidates": tuple(
         f"candidate_{name}"
         for name in (
             *("step", "brain", "inputs", "outputs", "values", "sensors", "activation", "script", "normaliser"),
-            "interface",
+            *("interface", "repair"),
         )
     ),
     "What Unity would say": ("releases", "actions", "brain_parameters"),

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 #: What only our readers are told.
-_READERS = ("step", "activation", "script", "normaliser", "interface", "trust_source")
+_READERS = ("step", "activation", "script", "repair", "normaliser", "interface", "trust_source")
 _UNTOLD = {"trust_source": False}
 
 

@@ -88,6 +88,7 @@ JUDGING = frozenset(
             "sensors",
             "activation",
             "script",
+            "repair",
             "source",
             "step",
         ),
@@ -138,6 +139,7 @@ _READING: Mapping[str, Callable[[Callable[..., Any]], Callable[..., Any]]] = {
         "--activation", metavar="NAME", help="Activation between the layers of a bare .pt: elu, tanh, …"
     ),
     "script": click.option("--script", metavar="NAME", help="Script that saved a bare .pt: ppo-pytorch-continuous, …"),
+    "repair": click.option("--repair", metavar="NAME", help="Mend a known fault of an ONNX's exporter: gru-reset."),
     "normaliser": click.option(
         "--normaliser", type=FILE, metavar="FILE", help="Statistics of a .zip: vecnormalize.pkl, if not next to it."
     ),

@@ -59,6 +59,8 @@ class Candidate(Struct, frozen=True):
     missing_ok: tuple[str, ...] = ()
     #: what the file states of its numbers
     interface: Interface | None = None
+    #: faults of the exporter that wrote it, as sentences
+    faults: tuple[str, ...] = ()
     #: names that its roles gave, as "the reference's = its own"
     by_role: tuple[str, ...] = ()
     #: what its weights were rounded to, where they were
@@ -83,6 +85,7 @@ class Candidate(Struct, frozen=True):
         """Yield what was not compared, or under another name, as sentences."""
         if self.missing_ok:
             yield f"not compared, as {self.label} never had it: {', '.join(self.missing_ok)}"
+        yield from (f"{self.label}: {fault}" for fault in self.faults)
         if self.by_role:
             yield f"{self.label}: {', '.join(self.by_role)}, by their roles"
 
@@ -144,7 +147,7 @@ def match_candidates(
     aliases = _with_user_names(_aliases(policy, reference), names, known)
     made = _made_here(reference, policy)
     return [
-        _chosen(label, artefact, reading, policy, aliases, made)
+        _feed_or_read(label, artefact, reading, policy, aliases, made)
         for label, artefact, reading in zip(labels, artefacts, readings, strict=True)
     ]
 
@@ -177,7 +180,7 @@ def _reading(
         return None
 
 
-def _chosen(
+def _feed_or_read(
     label: str,
     artefact: Artefact,
     reading: ReadCandidate | None,
@@ -208,7 +211,7 @@ def _chosen(
         return read if blocked or not read.missing(policy) else replace(fed, weights=weights)
     called = {**{n: p.name for n, p in fed.inputs.items()}, **fed.outputs}
     by_role = tuple(f"{n} = {other}" for n, other in called.items() if _base(other) not in aliases[n])
-    return replace(fed, weights=weights, by_role=by_role, interface=reading.policy.signature.interface)
+    return replace(fed, weights=weights, by_role=by_role, interface=reading.interface, faults=reading.faults)
 
 
 def labels_of(found: Sequence[Artefact]) -> list[str]:

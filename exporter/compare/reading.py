@@ -17,6 +17,7 @@ from converters.compiler.options import CompileOptions
 from converters.compiler.passes.weights import Storage
 from converters.files.children.process import LoadedModel, RunFailedError
 from converters.formats.format import Format, WriteOptions
+from converters.formats.onnx.exporters import FAULT_NOTE
 from converters.formats.registry import FROZEN_GRAPH, KERNELS, ONNX
 from converters.formats.source import OriginalRun, ReadOptions
 from converters.policy.policy import Policy
@@ -48,6 +49,11 @@ class ReadCandidate(Struct, frozen=True):
 
     #: what its weights were rounded to: a file that is read has them as they are
     weights: Storage | None = None
+
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """Faults of the exporter that wrote it, as sentences."""
+        return tuple(note for note in self.policy.signature.notes if note.startswith(FAULT_NOTE))
 
     @property
     def interface(self) -> Interface | None:
@@ -124,6 +130,7 @@ class ReadCandidate(Struct, frozen=True):
     def notes(self, reference: Policy, runtimes: Sequence[str]) -> Iterator[str]:
         """Yield what is compared otherwise than it is called, as sentences."""
         form, _ = self.place(runtimes)
+        yield from (f"{self.label}: {fault}" for fault in self.faults)
         if form is not None:
             yield f"{self.label} was run as export-model's {form.label.removeprefix('an ').removeprefix('a ')} of it"
         rows = self.policy.source.rows
@@ -227,7 +234,7 @@ class _Answering:
 
     def run(self, inputs: Sequence[Feeds], fetch: Sequence[str]) -> list[dict[str, np.ndarray]]:
         """Answer as a participant does."""
-        own = [{**self._feeds(feeds), **self._joined(feeds)} for feeds in inputs]
+        own = [{**self._feeds(feeds), **self._split_vectors(feeds)} for feeds in inputs]
         wanted = list(dict.fromkeys(self.outputs[name] for name in fetch))
         answers = self._model.run_all(own, wanted) if self._original is None else self._original.run_all(own)
         return [{name: self._as_reference(name, answer[self.outputs[name]]) for name in fetch} for answer in answers]
@@ -238,12 +245,12 @@ class _Answering:
             shape = [rows if n is None else n for n in spec.shape]
             if spec.name in self._fed:
                 ours = self._ours.input(self._fed[spec.name])
-                own[spec.name] = _laid_out(feeds[ours.name], ours, spec).astype(spec.dtype, copy=False)
+                own[spec.name] = _to_layout(feeds[ours.name], ours, spec).astype(spec.dtype, copy=False)
             elif spec.role in _NEUTRAL:
                 own[spec.name] = np.full(shape, _NEUTRAL[spec.role], spec.dtype)
         return own
 
-    def _joined(self, feeds: Feeds) -> dict[str, np.ndarray]:
+    def _split_vectors(self, feeds: Feeds) -> dict[str, np.ndarray]:
         """The vectors that are one on one side, and several on the other."""
         ours, theirs = self._pairing.joined
         if not ours:
@@ -253,12 +260,12 @@ class _Answering:
 
     def _as_reference(self, name: str, array: np.ndarray) -> np.ndarray:
         ours, theirs = self._ours.output(name), self._theirs.output(self.outputs[name])
-        array = _laid_out(array, theirs, ours)
+        array = _to_layout(array, theirs, ours)
         integers = array.dtype.kind in "iu" and np.dtype(ours.dtype).kind in "iu"
         return array.astype(ours.dtype, copy=False) if integers else array
 
 
-def _laid_out(array: np.ndarray, spec: TensorSpec, other: TensorSpec) -> np.ndarray:
+def _to_layout(array: np.ndarray, spec: TensorSpec, other: TensorSpec) -> np.ndarray:
     """Return an array of ``spec`` in the layout and rank of ``other``."""
     order = axes_to(spec.shape, other.shape)
     if order is not None:

@@ -344,7 +344,14 @@ def _source_of(source: Path, contract: Contract, step: int | None, trust_source:
     if normaliser not in (None, NO_NORMALISER):  # a file's name: it is expected beside the source
         normaliser = str(source.parent / normaliser)
     read = ReadOptions(
-        asked, origin.sensors, trust_source, origin.goals, origin.activation, normaliser, script=origin.script
+        asked,
+        origin.sensors,
+        trust_source,
+        origin.goals,
+        origin.activation,
+        normaliser,
+        script=origin.script,
+        repair=origin.repair,
     )
     found = read_source(source, read)
     if found.sha256 != origin.sha256:

@@ -139,6 +139,7 @@ def contract_of(
         goals=read.goals,
         activation=read.activation,
         script=read.script,
+        repair=read.repair,
         normaliser=None if read.normaliser is None else printable(Path(read.normaliser).name),
     )
     said = None if code is None else code.to_dict() or None

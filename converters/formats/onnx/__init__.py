@@ -27,6 +27,7 @@ FORMATS = (
         label="an ONNX model",
         sniff=_sniff,
         read=_source.read,
+        takes=frozenset(("repair",)),
         write=_writer.write,
         main="{name}.onnx",
         beside="{name}.onnx.data",

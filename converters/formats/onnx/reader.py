@@ -14,6 +14,7 @@ from msgspec.structs import replace
 from converters.files.external_data import Detached
 from converters.files.fetch import Fetched
 from converters.formats.onnx.batch_axis import Reading, dims_of, read_rows
+from converters.formats.onnx.exporters import repair_model
 from converters.formats.onnx.functions import all_nodes, inline_functions, opsets_of
 from converters.formats.onnx.half_precision import widen
 from converters.formats.onnx.importer.importer import Importer, joined_errors
@@ -68,16 +69,22 @@ class OnnxModel(Struct, frozen=True):
     alone: bool = False
     #: it is in half precision, and was read as float32
     halves: bool = False
+    #: faults of the exporter that it shows, or that were mended, as sentences
+    faults: tuple[str, ...] = ()
     #: what the graph is called
     name: str = ""
     #: node → what was decided of an input that a recurrent layer begins with
     decisions: Mapping[str, Decision] = field(default_factory=dict)
 
 
-def read_onnx(given: Fetched) -> OnnxModel:
-    """Read a model. Raises DamagedFileError, NotAPolicyError, UnsupportedOpError, GraphError."""
+def read_onnx(given: Fetched, repair: str | None = None) -> OnnxModel:
+    """Read a model, with the fault ``repair`` of its exporter mended.
+
+    Raises DamagedFileError, NotAPolicyError, UnsupportedOpError, GraphError, UsageError (exporters.py).
+    """
     detached = Detached()
     model, files = parse(given, detached)
+    faults = repair_model(model, repair)
     halves = widen(model, detached)
     opsets = opsets_of(model)
     graph = model.graph
@@ -111,6 +118,7 @@ def read_onnx(given: Fetched) -> OnnxModel:
         memories=_joint(reading, memories, outputs),
         alone=reading.alone,
         halves=halves,
+        faults=faults,
         name=graph.name,
         decisions={
             importer.values[n]: replace(d, tensor=importer.values[n])

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from functools import partial
 
+from msgspec.structs import replace
+
 from converters.files.fetch import Fetched
 from converters.formats.onnx.reader import read_onnx
 from converters.formats.onnx.trainers import understand
@@ -16,9 +18,11 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
 
     The model itself is run by onnxruntime, the draws of its samplers fed from outside (``lift``).
     """
-    model = read_onnx(given)
+    model = read_onnx(given, options.repair)
     graph, facts = understand(model)
-    copy = partial(safe_copy, given.path, []) if len(model.files) > 1 else None
+    facts = replace(facts, notes=(*facts.notes, *model.faults))
+    copied = len(model.files) > 1 or options.repair is not None
+    copy = partial(safe_copy, given.path, [], repair=options.repair) if copied else None
     original = OriginalRun("onnxruntime", given.path, {"lift": list(model.draws)}, copy=copy)
     producer = f"{model.producer}, opset {model.opset}" if model.producer else f"opset {model.opset}"
     return [SourceModel(graph, model.files, facts, original=original, producer=producer)]

@@ -14,6 +14,7 @@ from typing import Any
 
 from converters.files.external_data import Detached
 from converters.files.fetch import Fetched, read_bytes
+from converters.formats.onnx.exporters import repair_model
 from converters.formats.onnx.messages import files_of
 from converters.formats.onnx.proto import decode_model, inside, load_external
 from signatures.errors import UnsupportedOpError
@@ -43,15 +44,18 @@ COMPUTING = frozenset(_COMPUTING.split())
 _LAYOUTS = frozenset(("com.microsoft.nchwc", "com.ms.internal.nhwc"))
 
 
-def safe_copy(path: Path, wanted: Sequence[str], folder: Path) -> Path:
+def safe_copy(path: Path, wanted: Sequence[str], folder: Path, *, repair: str | None = None) -> Path:
     """A copy in ``folder`` of the model in the file ``path``, with all its weights in it.
 
-    Raises UnsupportedOpError where an op is not known to compute and do no more, DamagedFileError where weights lie
-    elsewhere.
+    ``repair`` is the fault of its exporter that is mended (exporters.py). Raises UnsupportedOpError where an op is not
+    known to compute and do no more, DamagedFileError where weights lie elsewhere.
     """
     copy = folder / path.name
     detached = Detached()
-    for name, data in files_of(self_contained_model(path, detached), detached, path.name).items():
+    model = self_contained_model(path, detached)
+    if repair is not None:
+        repair_model(model, repair)
+    for name, data in files_of(model, detached, path.name).items():
         data.write(folder / name)
     return copy
 
