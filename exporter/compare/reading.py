@@ -229,7 +229,7 @@ class _Answering:
         self._ours, self._theirs, self._model = reference.signature, own.signature, model
         self._fed = {theirs: ours for ours, theirs in pairing.inputs.items()}
         self._original = Original(model, own.signature, own.source) if as_it_is else None
-        answered = {s.name for s in own.signature.outputs} if self._original is None else self._original.answered
+        answered = {s.name for s in own.signature.outputs} if self._original is None else self._original.output_names
         self.outputs = {ours: theirs for ours, theirs in pairing.outputs.items() if theirs in answered}
 
     def run(self, inputs: Sequence[Feeds], fetch: Sequence[str]) -> list[dict[str, np.ndarray]]:

@@ -143,22 +143,22 @@ def _previous(signature: PolicySignature, recording: Recording) -> Iterator[Caus
 def _masks(signature: PolicySignature, recording: Recording) -> Iterator[Cause]:
     for spec in signature.inputs:
         if spec.role is Role.MASKS and spec.name in recording.logged:
-            yield from _inverted(spec.name, signature, recording)
+            yield from _inverse_mask(spec.name, signature, recording)
             if (recording.inputs[spec.name] < 1).any():
                 yield Cause("mask", spec.name, "the mask was not applied", on(spec.name, np.ones_like))
 
 
-def _inverted(name: str, signature: PolicySignature, recording: Recording) -> Iterator[Cause]:
+def _inverse_mask(name: str, signature: PolicySignature, recording: Recording) -> Iterator[Cause]:
     """The mask the other way round, which says nothing of the steps that it would leave no action."""
 
-    def decided(masks: Array) -> Array:
+    def leave_actions(masks: Array) -> Array:
         edges = np.cumsum((0, *signature.branches)).tolist()
         return np.asarray(np.all([(masks[:, a:b] < 1).any(axis=1) for a, b in pairwise(edges)], axis=0))
 
-    if decided(recording.inputs[name]).sum() < FEWEST:
+    if leave_actions(recording.inputs[name]).sum() < FEWEST:
         return
     heads = [head.name for head in signature.heads if not head.is_continuous and head.name in recording.outputs]
-    change = on(name, lambda a: np.where(decided(a)[:, None], 1 - a, a))
+    change = on(name, lambda a: np.where(leave_actions(a)[:, None], 1 - a, a))
     for head in heads[:1]:
         yield Cause(
             "mask",
@@ -166,7 +166,7 @@ def _inverted(name: str, signature: PolicySignature, recording: Recording) -> It
             "the mask was inverted",
             change,
             output=head,
-            answers=lambda a, r: np.where(decided(r.inputs[name])[:, None], a, np.nan),
+            answers=lambda a, r: np.where(leave_actions(r.inputs[name])[:, None], a, np.nan),
         )
 
 

@@ -20,6 +20,7 @@ from exporter.play.options import PlayOptions
 from exporter.play.recording import Recorder
 from exporter.play.replay import replay
 from exporter.play.worlds import MakeWorld
+from exporter.verify.asked import Inputs
 from exporter.verify.checks.rollout import rollout
 from exporter.verify.findings import Finding
 from exporter.verify.participants import Participant, PolicyUnderTest
@@ -27,7 +28,7 @@ from exporter.verify.plays import CONFIDENCE, DIFFERENT, EQUIVALENT, NOT_DECIDED
 from exporter.verify.reference import Reference
 from exporter.verify.report import ParityReport
 from exporter.verify.session import Session
-from exporter.verify.trial import Inputs, Trial
+from exporter.verify.trial import Trial
 from exporter.verify.verification import Participants, verify
 from signatures.batches import Arrays, Run
 from signatures.errors import ExportModelError

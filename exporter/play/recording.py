@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from exporter.verify.trial import Inputs
+from exporter.verify.asked import Inputs
 from signatures.batches import Arrays, Run
 from signatures.sampling import Case
 from signatures.spec import PolicySignature

@@ -23,7 +23,7 @@ def replay(trial: Trial, participant: Participant) -> Iterator[Finding]:
 
     An output whose first difference was found is not looked at in later steps: they follow from it, or say no more.
     """
-    allowance = trial.allowance(participant, "recorded steps")
+    allowance = trial.allowances.of(participant, "recorded steps")
     pairs = [
         (case, expected)
         for number, (case, expected) in enumerate(zip(trial.cases, trial.expected, strict=True))

@@ -54,6 +54,8 @@ class Choices:
             for rival in range(_RIVALS + 1):
                 made, changed = dict(feeds), False
                 for node, (order, near) in zip(choices, ranked, strict=True):
+                    if changed:  # its scores may hang on a choice that was made otherwise
+                        order, near = self._rank(node, made, tolerance, None)
                     place = min(rival, order.shape[-1] - 1)
                     chosen = np.where(near[..., place], order[..., place], order[..., 0])
                     changed = changed or bool((chosen != order[..., 0]).any())

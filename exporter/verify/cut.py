@@ -72,11 +72,6 @@ class CutPolicy(Struct, frozen=True):
     samplers: tuple[CutSampler, ...]
     actions: Mapping[str, Sequence[str]]
 
-    @property
-    def drawn(self) -> list[str]:
-        """The policy's outputs that hang on a sampler."""
-        return list(dict.fromkeys(name for names in self.actions.values() for name in names))
-
     def draw(self, inputs: Sequence[dict[str, np.ndarray]], model: LoadedModel, seed: int) -> None:
         """Put what samplers may draw into ``inputs``, each of every class that is allowed there. Raises RunFailedError.
 

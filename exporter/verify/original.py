@@ -76,7 +76,7 @@ class Original:
         return bool(self.source.branches) and all(b is not None for b in self.source.branches)
 
     @property
-    def answered(self) -> frozenset[str]:
+    def output_names(self) -> frozenset[str]:
         """The outputs that it answers for."""
         given = {n for n in self.source.fetches if self.signature.output(n).role is not Role.SAMPLED}
         given |= {s.name for s in self.signature.outputs if s.name in self.source.parts}

@@ -17,6 +17,7 @@ from converters.formats.registry import narrows
 from converters.graph.nodes import Graph
 from converters.graph.run import run_graph
 from converters.runtimes.pool import RuntimePool
+from exporter.verify.asked import Inputs, Question
 from exporter.verify.bisection import Bisector
 from exporter.verify.choices import Choices, broken_ties
 from exporter.verify.cut import CutPolicy, cut_policy
@@ -31,7 +32,6 @@ from exporter.verify.difference import (
     is_marked,
     near_best,
     score_bounds,
-    spread,
 )
 from exporter.verify.excuses import (
     CHAOS,
@@ -50,10 +50,11 @@ from exporter.verify.options import VerifyOptions
 from exporter.verify.participants import Feeds, Participant, PolicyUnderTest
 from exporter.verify.reference import Reference
 from exporter.verify.rounding import Hull, Rounding, hull
+from exporter.verify.spreads import Spreads
 from exporter.verify.tolerances import Tolerance, tolerance_by_rules, tolerance_for
-from exporter.verify.work import Allowance, products
+from exporter.verify.work import Allowances
 from signatures.roles import Role
-from signatures.sampling import FAR_CASES, Case, draw_cases, draw_rollout, unknown_ids
+from signatures.sampling import FAR_CASES, HUGE_BATCH, Case, draw_cases, draw_rollout, unknown_ids
 
 Arrays = dict[str, np.ndarray]
 Hulls = Mapping[str, Hull]
@@ -61,24 +62,6 @@ Hulls = Mapping[str, Hull]
 _GIVE_UP_FACTOR = 8
 #: Outputs that an argmax is taken of.
 _SCORES = (Role.LOG_PROBS, Role.PROBS, Role.Q_VALUES)
-
-
-class Inputs(Struct, frozen=True):
-    """What a policy is asked in place of inputs that are drawn: states that were met, and steps in a row."""
-
-    cases: Sequence[Case]
-    steps: Sequence[Feeds] = ()
-
-
-class Question(Struct, frozen=True):
-    """What rules that forgive are asked of: an answer, the input or step, and how far it is off as it is."""
-
-    name: str
-    expected: Feeds
-    got: np.ndarray
-    participant: Participant
-    at: Case | int
-    found: Difference
 
 
 class Cut(Struct, frozen=True, eq=False):
@@ -95,7 +78,13 @@ class Trial:
         self.tested, self.pool, self.options = tested, pool, options
         self.signature = tested.signature
         self.golden = Golden() if options.golden is None else read_golden(Path(options.golden), self.signature)
-        drawn = draw_cases(self.signature, seed=options.seed, samples=options.samples)
+        rows = tested.source_map.rows if tested.source is not None else None
+        # An original for a fixed number of rows would run thousands of times for the largest batch.
+        drawn = [
+            case
+            for case in draw_cases(self.signature, seed=options.seed, samples=options.samples)
+            if rows is None or case.batch < HUGE_BATCH
+        ]
         self.cases = [*drawn, *self.golden.cases]
         recurrent = bool(self.signature.recurrences)
         self.steps: list[Feeds] = []
@@ -105,10 +94,8 @@ class Trial:
         self._typical = [case for case in drawn if case.name.startswith("typical")]
         self._scores = {s.name for s in self.signature.outputs if s.role is Role.LOG_PROBS}
         self.choices = Choices(tested.graph)
-        self._cost = 0
-        self._allowances: dict[tuple[str, str], Allowance] = {}
-        #: format → the runtime that is given the dearest input
-        self._first: dict[str, str] = {}
+        #: what time there is for each artefact in each runtime
+        self.allowances = Allowances(tested.graph)
         #: files that were started twice, to see whether they draw alike
         self.started: set[Path] = set()
         #: what is to be known of a runtime, for the report
@@ -160,20 +147,8 @@ class Trial:
         numbers = [s.name for s in self.signature.outputs if s.name not in reference.drawn and s.dtype == "float32"]
         self.rounding = Rounding(self.options.seed, numbers, self._comparable)
         self.bisector = Bisector(self.tested, self.pool, self._is_right, self.rounding.inner)
-        self._spreads: dict[str, np.ndarray | None] = {}
+        self._spreads = Spreads(self._typical_answers)
         self._flushed: dict[str, Arrays] = {}
-
-    def allowance(self, participant: Participant, purpose: str = "inputs") -> Allowance:
-        """What time there is for an artefact in a runtime; there is as much for inputs as for draws."""
-        key = (f"{participant.name} in {participant.runtime}", purpose)
-        if key not in self._allowances:
-            self._cost = self._cost or products(self.tested.graph)
-            self._allowances[key] = Allowance(self._cost, participant.runtime)
-        return self._allowances[key]
-
-    def first_of(self, participant: Participant) -> bool:
-        """Whether this runtime is the first of its format."""
-        return self._first.setdefault(participant.name, participant.runtime) == participant.runtime
 
     def notes(self) -> list[str]:
         """What was left out, for the report, and what could not be fed."""
@@ -181,10 +156,7 @@ class Trial:
             f"which integers {name} takes is not known: 0 and 1 were tried, and no others"
             for name in unknown_ids(self.signature)
         ]
-        return [*unknown, *self._left_out(), *self.remarks]
-
-    def _left_out(self) -> list[str]:
-        return [note for (who, _), each in self._allowances.items() if (note := each.note(who)) is not None]
+        return [*unknown, *self.allowances.notes(), *self.remarks]
 
     def is_drawn(self, name: str, participant: Participant) -> bool:
         """Whether the reference or the participant draws an output: there is no number to compare then."""
@@ -334,36 +306,20 @@ class Trial:
             narrowed=narrows(participant.format),
             rounding=None if rounding is None or got.dtype.kind != "f" else rounding.get(name),
             most=self._most(name, participant),
-            ceiling=self._ceiling(name, reference),
+            ceiling=self._spreads.ceiling(name, reference),
         )
 
-    def _ceiling(self, name: str, reference: np.ndarray) -> np.ndarray | float:
-        """What rounding may explain at most: how far the output varies; of far numbers, a thousandth of each."""
-        found = self._spread(name)
-        if reference.dtype.kind != "f" or found is None or not np.isfinite(found).any():
-            return np.inf
-        sizes = np.abs(np.nan_to_num(reference, posinf=0, neginf=0))
-        return np.asarray(np.maximum(found[np.isfinite(found)].max(), SHARE * sizes))
-
     def _most(self, name: str, participant: Participant) -> np.ndarray | None:
-        """What an output that hardly varies may be off, column by column: a share of how far it varies.
+        """What an output that hardly varies may be off, column by column, where no other tolerance was given."""
+        return self._spreads.share(name) if self.tolerance(name, participant) == Tolerance() else None
 
-        A tolerance that a user or the table gave stays as it is, and so does that of a column that is always the same.
-        """
-        found = self._spread(name) if self.tolerance(name, participant) == Tolerance() else None
-        return None if found is None else SHARE * found
-
-    def _spread(self, name: str) -> np.ndarray | None:
-        """How far each column of an output varies over typical inputs."""
-        if name not in self._spreads:
-            typical = {id(case) for case in self._typical}
-            made = [
-                self._comparable(answers)[name]
-                for case, answers in zip(self.cases, self.expected, strict=True)
-                if name in answers and id(case) in typical
-            ]
-            self._spreads[name] = spread(made)
-        return self._spreads[name]
+    def _typical_answers(self, name: str) -> list[np.ndarray]:
+        typical = {id(case) for case in self._typical}
+        return [
+            self._comparable(answers)[name]
+            for case, answers in zip(self.cases, self.expected, strict=True)
+            if name in answers and id(case) in typical
+        ]
 
     def bisect(
         self, participant: Participant, output: str, difference: Difference, feeds: Feeds, branch: int = 0
@@ -474,7 +430,7 @@ class Trial:
             return []
         made = self._comparable({scores: expected[scores]})[scores]
         tolerance, explained = self._choice_tolerance(name, participant), rounding.get(scores, 0.0)
-        ceiling = self._ceiling(scores, made)
+        ceiling = self._spreads.ceiling(scores, made)
         told = score_bounds(made, branches, tolerance, np.where(explained < OPEN * ceiling, explained, 0.0))
         widest = score_bounds(made, branches, tolerance, np.minimum(explained, ceiling))
         found = [(TIE, is_marked(near_best(*told, branches), got, branches))]

@@ -9,6 +9,7 @@ from msgspec.structs import replace
 
 from converters.files.children.process import LoadedModel, RunFailedError
 from converters.runtimes.pool import INDEPENDENT
+from exporter.verify.asked import Inputs
 from exporter.verify.checks.agents import agents
 from exporter.verify.checks.baked import check_baked
 from exporter.verify.checks.consumer import consumers
@@ -30,7 +31,7 @@ from exporter.verify.participants import (
 from exporter.verify.reference import Reference
 from exporter.verify.report import ParityReport
 from exporter.verify.session import Session
-from exporter.verify.trial import Inputs, Trial
+from exporter.verify.trial import Trial
 from exporter.verify.verdict import key_of, required_reason
 
 #: Who takes part beside the reference: given the numpy reference and where failures go.

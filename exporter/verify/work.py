@@ -10,6 +10,7 @@ from converters.graph.ops.table import traits
 from converters.graph.shapes import infer_types
 from converters.graph.types import TensorType
 from converters.runtimes.registry import RUNTIMES
+from exporter.verify.participants import Participant
 
 #: What one policy may take in one runtime, about.
 SECONDS = 20
@@ -48,6 +49,32 @@ class Allowance:
             return None
         shown = ", ".join(self.left_out)
         return f"{who} is slow ({self.cost / 1e6:.3g} million products for a row); left out there: {shown}"
+
+
+class Allowances:
+    """What time there is for each artefact of a policy in each runtime."""
+
+    def __init__(self, graph: Graph) -> None:
+        self._graph, self._cost = graph, 0
+        self._known: dict[tuple[str, str], Allowance] = {}
+        #: format → the runtime that is given the dearest input
+        self._first: dict[str, str] = {}
+
+    def of(self, participant: Participant, purpose: str = "inputs") -> Allowance:
+        """Return that of an artefact in a runtime; there is as much for inputs as for draws."""
+        key = (f"{participant.name} in {participant.runtime}", purpose)
+        if key not in self._known:
+            self._cost = self._cost or products(self._graph)
+            self._known[key] = Allowance(self._cost, participant.runtime)
+        return self._known[key]
+
+    def is_first(self, participant: Participant) -> bool:
+        """Whether the runtime is the first of its format."""
+        return self._first.setdefault(participant.name, participant.runtime) == participant.runtime
+
+    def notes(self) -> list[str]:
+        """Return what was left out, a sentence each."""
+        return [note for (who, _), each in self._known.items() if (note := each.note(who)) is not None]
 
 
 def products(graph: Graph) -> int:

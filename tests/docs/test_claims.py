@@ -23,7 +23,7 @@ from exporter.verify.options import VerifyOptions
 from exporter.verify.tolerances import ATOL, RTOL, Tolerance, tolerance_for
 from exporter.verify.work import SECONDS
 from signatures.errors import ParityError, RuntimeUnavailableError, SourceError, UsageError
-from signatures.sampling import LARGE_BATCH, MOST_IDS
+from signatures.sampling import HUGE_BATCH, LARGE_BATCH, MOST_IDS
 from tests.commands import ROOT, export_model
 from tests.docs.blocks import name_of, pages
 
@@ -40,6 +40,7 @@ FOREIGN = {
         "--inputs",
         "--outputs",
         "--first",
+        "--write",  # of python -m tests.faults
     ),
 }
 NUMBER = re.compile(r"1e-5 \+ 1e-5·\|b\|")
@@ -90,7 +91,7 @@ def test_the_figures_of_agreement_are_those_of_the_program() -> None:
         f"at {mixed.DRAWS} rows of many inputs in one batch ({mixed.FEW} with",
         f"classes against the reference's log-probabilities, {mixed.DRAWS} draws",
         "down to one in 10⁹",
-        f"and {LARGE_BATCH} (1 to 7",
+        f"and {LARGE_BATCH}, and of vectors alone one of {HUGE_BATCH:,} in",
         f"no more than {MOST_IDS} ",
         f"about {SECONDS} seconds of inputs",
         "never less than 2⁻¹⁷",

@@ -63,7 +63,7 @@ def channel_orders(file: OnnxFile) -> Mapping[str, Order]:
         known = orders.get(name)
         if known in (order, Order.NATIVE) or (known is Order.LAST and order is not Order.NATIVE):
             continue
-        order = _turned(file, nodes.get(name), order, downstream=downstream)
+        order = _order_at(file, nodes.get(name), order, downstream=downstream)
         if order in (Order.TO_LAST, Order.TO_FIRST) and order is known:
             continue
         orders[name] = order
@@ -81,7 +81,7 @@ _AHEAD = {Order.TO_LAST: Order.LAST, Order.TO_FIRST: Order.FIRST}
 _MOST_STEPS = 1 << 7
 
 
-def _turned(file: OnnxFile, node: Any, order: Order, *, downstream: bool) -> Order:
+def _order_at(file: OnnxFile, node: Any, order: Order, *, downstream: bool) -> Order:
     """What a node is taken for that is reached with an order, from above or from below."""
     if node is None:
         return order

@@ -85,7 +85,7 @@ class Header(Struct, frozen=True):
         """All that a decision is made of."""
         return (*self.inputs, *self.own_values)
 
-    def chosen(self, branches: Sequence[int]) -> Field | None:
+    def choice_field(self, branches: Sequence[int]) -> Field | None:
         """The output that classes are drawn by, where there is one of so many branches."""
         found = next((f for f in self.outputs if f.spec.role is Role.LOG_PROBS), None)
         return found if found is not None and sum(branches) == found.size else None

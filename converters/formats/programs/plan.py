@@ -125,7 +125,7 @@ def _plan(policy: Policy, options: WriteOptions) -> Plan:
         header=header,
         program=program,
         contract=text,
-        chosen=header.chosen(sizes),
+        chosen=header.choice_field(sizes),
         sizes=sizes,
         checked=checked,
         golden=golden,

@@ -112,7 +112,9 @@ def _agents_driver(header: Header, code: CodeOptions, branches: Sequence[int]) -
         "void judge_choose(int count, int32_t *classes)": [
             "    (void)count;\n    (void)classes;",
             f"{each}for (int n = 0; n < count; n++, classes += {len(branches)})",
-            f"        {p}_choose(&memories[i], &outputs[i], classes);" if header.chosen(branches) else "        {}",
+            f"        {p}_choose(&memories[i], &outputs[i], classes);"
+            if header.choice_field(branches)
+            else "        {}",
         ],
         "int judge_sizes(int32_t *sizes, int32_t *counts)": [
             f"    static const int32_t known[] = {{{sizes}0}};",

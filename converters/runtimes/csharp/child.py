@@ -127,7 +127,7 @@ def _agents_driver(header: Header, code: CodeOptions, branches: Sequence[int]) -
                 agent.Choose(classes);
                 foreach (int one in classes) writer.Write(one);
             }}"""
-        if header.chosen(branches)
+        if header.choice_field(branches)
         else ""
     )
     return f"""

@@ -67,7 +67,7 @@ class _Played:
         self.trial, self.participant, self.signature = trial, participant, contract.signature
         self.code = CodeOptions.of(contract.tool)
         self.header: Header = header_of(participant.path.stem, contract.signature, self.code)
-        self.chosen = self.header.chosen(self.signature.branches)
+        self.chosen = self.header.choice_field(self.signature.branches)
         called = [n for n in participant.outputs if trial.is_drawn(n, participant)]
         self.drawn = [n for n in called if trial.signature.output(n).batched]
         self.observed = list(_observations(trial, trial.options.steps))
@@ -107,7 +107,7 @@ class _Played:
         """Decisions of each step: enough draws of numbers that are drawn, as far as there is time for them."""
         steps = len(self.observed) * AGENTS
         wanted = max([DRAWS if self.drawn else 1, *(-(-_NOISE // (steps * f.size)) for f in self.header.noise)])
-        allowance = self.trial.allowance(self.participant, "draws")
+        allowance = self.trial.allowances.of(self.participant, "draws")
         if allowance.takes(wanted * steps, f"{wanted * steps} decisions of agents"):
             return wanted
         return max(1, allowance.left // steps)

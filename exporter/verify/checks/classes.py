@@ -42,7 +42,7 @@ def classes(trial: Trial, participant: Participant, names: Sequence[str]) -> Ite
             continue
         single = one_row_at_a_time(participant)
         wanted = FEW if single or has_pictures(trial) else DRAWS
-        count = trial.allowance(participant, "draws").at_most(wanted, "draws")
+        count = trial.allowances.of(participant, "draws").at_most(wanted, "draws")
         known = [(c, r) for c, r in _decided_places(trial, scores.name) if not np.isnan(odds[id(c)][r]).any()]
         if not count or not known:
             continue

@@ -36,7 +36,7 @@ def densities(trial: Trial, participant: Participant, names: Sequence[str]) -> I
     """
     vectors = all(len(s.shape) <= 2 for s in trial.signature.observations)
     count = DENSITY_DRAWS if vectors else DRAWS
-    if not names or not trial.allowance(participant, "draws").takes(count, f"{count} draws of numbers"):
+    if not names or not trial.allowances.of(participant, "draws").takes(count, f"{count} draws of numbers"):
         return
     kinds = places(trial)[:KINDS]
     rows = [kinds[i % len(kinds)] for i in range(count)]

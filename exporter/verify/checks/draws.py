@@ -125,7 +125,7 @@ def _sampler_findings(trial: Trial, cut: Cut, way: CutArtefact, names: Sequence[
     """How well each sampler's draws fit what it draws from, for the outputs that hang on it."""
     participant, samplers = way.participant, list(way.own.values())
     single = one_row_at_a_time(participant) and any(s.scores is not None for s in samplers)
-    count = trial.allowance(participant, "draws").at_most(FEW if single or has_pictures(trial) else DRAWS, "draws")
+    count = trial.allowances.of(participant, "draws").at_most(FEW if single or has_pictures(trial) else DRAWS, "draws")
     if not count or not samplers:
         return
     scores = [s.scores for s in samplers if s.scores is not None]
@@ -160,7 +160,7 @@ def _repetitions(trial: Trial, participant: Participant, names: Sequence[str]) -
         return {}
     single = one_row_at_a_time(participant)
     count = FEW_REPEATED if single or has_pictures(trial) else REPEATED
-    if not trial.allowance(participant, "draws").takes(4 * count, "draws of two starts and two calls"):
+    if not trial.allowances.of(participant, "draws").takes(4 * count, "draws of two starts and two calls"):
         return {}
     rows = in_turn(trial, places(trial), count)
     pair = [rows_at(trial, rows, single=single, run=run) for run in range(2)]

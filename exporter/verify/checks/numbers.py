@@ -27,12 +27,12 @@ def numbers(trial: Trial, participant: Participant) -> Iterator[Finding]:
     """
     worst: dict[str, tuple[Difference, Case]] = {}
     every: dict[str, list[Difference]] = {}
-    allowance, recorded = trial.allowance(participant), len(trial.golden.cases)
+    allowance, recorded = trial.allowances.of(participant), len(trial.golden.cases)
     allowance.left -= 2 * len(trial.steps)
     tried: list[tuple[Case, Feeds]] = []
     for number, (case, expected) in enumerate(zip(trial.cases, trial.expected, strict=True)):
         optional = 0 < number < len(trial.cases) - recorded
-        if case.batch >= HUGE_BATCH and not trial.first_of(participant):
+        if case.batch >= HUGE_BATCH and not trial.allowances.is_first(participant):
             continue
         if not optional or allowance.takes(case.batch, case.name):
             tried.append((case, expected))
