@@ -9,7 +9,7 @@ PYTEST := $(BIN)/python -m pytest
 # Where the machine forbids it, each of hundreds of processes would compile all modules anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: install browser compiler demo check test lint types docs gallery figures pictures bench fuzz train clean help
+.PHONY: install browser compiler demo check test lint types docs gallery figures pictures bench fuzz sizes train clean help
 
 help:
 	@echo "make install   .venv with every extra, and the locked npm packages"
@@ -20,6 +20,7 @@ help:
 	@echo "make gallery   five trained policies that act in a browser, as a static folder in build/gallery"
 	@echo "make figures   docs/figures.md anew, from ../shared (minutes), docs/consumers.md and operators.md"
 	@echo "make pictures  the pictures of the page and of a report in docs/pictures, anew, from Chromium (minutes)"
+	@echo "make sizes     code lines of each room beside what it may have, and what was added since REV=…"
 	@echo "make bench     speed, memory and size beside what a user would run instead"
 	@echo "make fuzz      damaged files of every kind, N=20000 of each (hours); what came of them, counted"
 	@echo "make train     the policies of fixtures/trained anew, in an environment of its own (minutes)"
@@ -63,6 +64,11 @@ lint: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/python -m tests.audit
+	$(BIN)/python -m tests.sizes
+
+# What each room has beside what it may have, and what was added since REV (the last tag).
+sizes: install
+	$(BIN)/python -m tests.sizes $(REV)
 
 types: install
 	$(BIN)/mypy
