@@ -18,10 +18,13 @@ from exporter.logs.trials import Trials
 from exporter.verify.findings import Finding
 from exporter.verify.participants import Feeds, Participant, Run
 from exporter.verify.trial import Trial
+from exporter.verify.work import products
 from signatures.roles import Role
 from signatures.sampling import draw_rollout
 from signatures.spec import PolicySignature
 
+#: Products that a row may cost: thousands of causes are tried on dozens of rows.
+_MOST_PRODUCTS = 3_000_000
 #: Episodes side by side, and steps of each.
 _EPISODES, _STEPS = 16, 16
 
@@ -56,7 +59,7 @@ class Explaining:
     def __call__(self, trial: Trial, participant: Participant) -> Iterator[Finding]:
         """Explain what a participant's actions are, if they are not the reference's."""
         heads = _shared_actions(trial, participant)
-        if heads:
+        if heads and products(trial.tested.graph) <= _MOST_PRODUCTS:
             self.notes += _explanations(trial, participant, heads)
         yield from ()
 

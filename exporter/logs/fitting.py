@@ -40,9 +40,9 @@ class _Column(Struct, frozen=True):
 def fitted_causes(few: Trials, chain: Chain) -> list[Cause]:
     """Causes that explain the steps of ``few`` by a scale and an offset of one column, or of one observation."""
     numbers = [t for t in few.targets if not t.branches]
-    if not numbers:
-        return []
     columns = _columns(few.replay.signature, few.recording)
+    if not numbers or not columns:
+        return []
     best: dict[_Column, tuple[float, Array]] = {}
     for start in STARTS:
         unknowns = np.tile(np.asarray(start), (len(columns), 1))

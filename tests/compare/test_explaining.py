@@ -11,6 +11,8 @@ import pytest
 from onnx import helper, numpy_helper
 
 from converters.runtimes.pool import RuntimePool
+from exporter.export.pipeline import ExportOptions, export
+from fixtures import path as fixture
 from tests.comparing import compare_artefacts
 
 ROOT = Path(__file__).resolve().parents[2] / "fixtures"
@@ -25,12 +27,12 @@ def constant(model: onnx.ModelProto, value: np.ndarray) -> str:
     return name
 
 
-def before_input(op: str, *operands: np.ndarray, **attributes: int) -> Edit:
-    """An op between the first input and the graph."""
+def before_input(op: str, *operands: np.ndarray, place: int = 0, **attributes: int) -> Edit:
+    """An op between an input and the graph."""
 
     def edit(model: onnx.ModelProto) -> None:
         graph = model.graph
-        name = graph.input[0].name
+        name = graph.input[place].name
         for node in graph.node:
             node.input[:] = ["planted" if i == name else i for i in node.input]
         given = [constant(model, value) for value in operands]
@@ -52,6 +54,12 @@ def after_output(op: str, *operands: np.ndarray, **attributes: int) -> Edit:
         graph.node.append(helper.make_node(op, ["planted", *given], [name], **attributes))
 
     return edit
+
+
+def other_weights(model: onnx.ModelProto) -> None:
+    for weight in (t for t in model.graph.initializer if len(t.dims) == 2):
+        values = np.random.default_rng(0).standard_normal(weight.dims).astype(np.float32)
+        weight.CopyFrom(numpy_helper.from_array(values, weight.name))
 
 
 def order(size: int, i: int, j: int) -> np.ndarray:
@@ -93,12 +101,25 @@ def test_a_difference_is_called_what_it_is(name: str, tmp_path: Path, pool: Runt
     assert words in sentence
 
 
-def test_what_nothing_explains_has_no_name(tmp_path: Path, pool: RuntimePool) -> None:
-    def other_weights(model: onnx.ModelProto) -> None:
-        for weight in (t for t in model.graph.initializer if len(t.dims) == 2):
-            values = np.random.default_rng(0).standard_normal(weight.dims).astype(np.float32)
-            weight.CopyFrom(numpy_helper.from_array(values, weight.name))
+@pytest.mark.parametrize("right", [False, True])
+def test_an_image_upside_down_is_called_so(tmp_path: Path, pool: RuntimePool, right: bool) -> None:
+    (result,) = export([fixture("visual")], ExportOptions(tmp_path, targets=("onnx",), verify="none"))
+    own = result.folder / "visual.onnx"
+    height = onnx.load(own).graph.input[1].type.tensor_type.shape.dim[1].dim_value
+    wrong = planted(
+        own, tmp_path / "wrong.onnx", before_input("Gather", np.arange(height)[::-1].copy(), place=1, axis=1)
+    )
+    named = sentences(own, own if right else wrong, pool)
+    assert [("upside down" in sentence) for sentence in named] == ([] if right else [True])
 
+
+def test_an_image_and_other_weights_have_no_name(tmp_path: Path, pool: RuntimePool) -> None:
+    (result,) = export([fixture("visual")], ExportOptions(tmp_path, targets=("onnx",), verify="none"))
+    own = result.folder / "visual.onnx"
+    assert sentences(own, planted(own, tmp_path / "other.onnx", other_weights), pool) == []
+
+
+def test_what_nothing_explains_has_no_name(tmp_path: Path, pool: RuntimePool) -> None:
     assert sentences(CONTINUOUS, planted(CONTINUOUS, tmp_path / "other.onnx", other_weights), pool) == []
 
 
