@@ -74,7 +74,7 @@ class Bisector:
             return Bisection(None, reason="no graph at hand computes what the reference does")
         try:
             rounding = partial(self._rounding, participant.runtime)
-            search = _Search(graph, self._within(participant), feeds, tolerance, rounding, self._source)
+            search = _Search(graph, self._within(participant), feeds, tolerance, rounding, self.source_of)
             return search.first(output, branch)
         except (ExportModelError, OSError) as error:
             why = getattr(error, "why", None)
@@ -114,7 +114,7 @@ class Bisector:
                 continue
             difference = compare(known[name], array, Tolerance(0, 0))
             if not difference.passed:
-                found.append(_bisection_at(graph.producer(name), name, known[name], array, difference, self._source))
+                found.append(_bisection_at(graph.producer(name), name, known[name], array, difference, self.source_of))
         return found
 
     @cached_property
@@ -157,8 +157,8 @@ class Bisector:
                 found.update({} if origins is None else origins(path))
         return found
 
-    def _source(self, node: Node) -> str | tuple[str, ...] | None:
-        """The source's tensor: what the graph knows of it, else what an artefact notes."""
+    def source_of(self, node: Node) -> str | tuple[str, ...] | None:
+        """Return the source's tensor: what the graph knows of it, else what an artefact notes."""
         if node.origin is None or node.origin == f"{node.name}:0":
             return self._origins.get(node.name, node.origin)
         return node.origin

@@ -11,7 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from converters.files.children import confinement
 from converters.files.children.bounded import run_bounded
+from converters.files.children.environment import readable_places
 from converters.files.children.process import RunFailedError
 from converters.formats.format import WriteOptions
 from converters.formats.programs.members import answers, header_of
@@ -223,11 +225,19 @@ int main(void)
         assert abs(count - 4000 * share) <= 5 * (4000 * share * (1 - share)) ** 0.5 + 1
 
 
+@pytest.fixture
+def readable(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a child that confined itself lets the processes read that it starts."""
+    monkeypatch.setattr(confinement, "_readable", list(readable_places([sys.executable])))
+
+
+@pytest.mark.usefixtures("readable")
 def test_the_memory_of_a_compiler_is_bounded(tmp_path: Path) -> None:
     done = run_bounded([sys.executable, "-c", "x = bytearray(1 << 32)"], tmp_path, 1 << 30, 9)
     assert "MemoryError" in done.stderr
 
 
+@pytest.mark.usefixtures("readable")
 def test_the_time_of_a_compiler_is_bounded(tmp_path: Path, here: RuntimePool) -> None:
     """By a header whose macros become 2 to the 40 words."""
     doubled = "".join(f"#define A{i} A{i - 1} A{i - 1}\n" for i in range(1, 41))

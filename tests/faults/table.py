@@ -189,7 +189,7 @@ FAULTS = (
         "action",
         ("multinomial_1/Multinomial",),
         "Multinomial",
-        "draws",
+        words="that its classes are drawn from",
     ),
     Fault(
         "a sampler with a fixed seed",

@@ -25,8 +25,9 @@ pytestmark = [pytest.mark.legacy, pytest.mark.slow]
 SOURCES = [*(FOLDER / f"{n}.onnx" for n in POLICIES), *sorted(SHARED.glob("corpus/onnx/*.onnx"))]
 #: Log-probabilities of classes that are next to impossible follow from differences of large logits.
 CLOSE = Tolerance(5e-4, 1e-5)
-#: Verification measures what rounding makes there, this does not: SoccerTwos has logits of 36,000 for whole numbers.
-_ROUNDED = (*FAR_CASES, "whole numbers")
+#: Verification measures what rounding makes there, this does not: SoccerTwos has logits of 36,000 for whole numbers,
+#: and at the edges of the clip such that a unit in the last place is 2⁻⁹.
+_ROUNDED = (*FAR_CASES, "whole numbers", "clip edges")
 
 
 @pytest.fixture(scope="module", params=VERSIONS)

@@ -36,6 +36,7 @@ REPEATED, FEW_REPEATED, DIFFERING = 512, 128, 30
 STARTED_ALIKE = "its draws are the same after every start: a sampler has a fixed seed"
 CALLED_ALIKE = "its draws are the same in every call: the sampler begins anew each time"
 STILL_DRAWN = "it draws where the policy does not: its answers differ where all that the policy draws is the same"
+MISFED = "it draws from other odds than the policy, though every tensor of the policy agrees"
 ODDS = "the log-probabilities that its classes are drawn from differ by {:.3g}"
 #: Where all sessions of a process begin alike whatever the model, two processes are what tells.
 _ALIKE = frozenset(r.name for r in RUNTIMES if r.sessions_alike)
@@ -96,24 +97,28 @@ def _findings_of(trial: Trial, cut: Cut, way: CutArtefact, names: Sequence[str])
         fits = (cut.trial.difference(n, expected, one[n], made, case).passed for n in one)
         if not all(fits):
             return None
-    found = _by_output(cut, names, numbers(cut.trial, made))
+    found = _by_output(trial, cut, names, numbers(cut.trial, made))
     memory = cut.trial.signature.memory
     if memory is not None and memory.output in names:
-        found += _by_output(cut, names, rollout(cut.trial, made))
+        found += _by_output(trial, cut, names, rollout(cut.trial, made))
     failed = {f.output for f in found if not f.passed}
     if made.runtime in _POOR:
         return found
     return [*found, *(f for f in _sampler_findings(trial, cut, way, names) if f.output not in failed)]
 
 
-def _by_output(cut: Cut, names: Sequence[str], found: Iterator[Finding]) -> list[Finding]:
+def _by_output(trial: Trial, cut: Cut, names: Sequence[str], found: Iterator[Finding]) -> list[Finding]:
     """One finding for each output, that of the odds that it is drawn from where that is the worse."""
-    odds = {s.odds.name: cut.policy.actions[s.name] for s in cut.policy.samplers if s.odds is not None}
+    behind = {s.odds.name: s.name for s in cut.policy.samplers if s.odds is not None}
+    odds = {name: cut.policy.actions[sampler] for name, sampler in behind.items()}
     worst: dict[str, Finding] = {}
     for finding in found:
         for output in [n for n in odds.get(finding.output, [finding.output])[:1] if n in names]:
             if finding.output in odds and not finding.passed:
-                finding = replace(finding, reason=finding.reason or ODDS.format(finding.max_abs_diff))
+                sampler = _sampler(trial, behind[finding.output], MISFED)
+                found_at = finding.bisection if finding.bisection and finding.bisection.tensor else sampler
+                reason = finding.reason or ODDS.format(finding.max_abs_diff)
+                finding = replace(finding, reason=reason, bisection=found_at)
             finding = replace(finding, output=output)
             before = worst.get(output)
             if before is None or (before.passed, -before.share) > (finding.passed, -finding.share):
@@ -146,9 +151,14 @@ def _draws_finding(
 ) -> Finding:
     begins = None
     if not difference.passed:
-        op = next((n.op for n in trial.tested.graph.nodes if n.name == sampler), None)
-        begins = Bisection(sampler, op, reason="what it draws from agrees, what it draws does not")
+        begins = _sampler(trial, sampler, "what it draws from agrees, what it draws does not")
     return trial.finding(Draws, participant, name, difference, MIXED, bisection=begins)
+
+
+def _sampler(trial: Trial, name: str, reason: str) -> Bisection:
+    """Where a difference begins that is a sampler's."""
+    node = next((n for n in trial.tested.graph.nodes if n.name == name), None)
+    return Bisection(name) if node is None else Bisection(name, node.op, trial.bisector.source_of(node), reason=reason)
 
 
 # ---- draws that come again
