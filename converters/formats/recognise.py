@@ -124,8 +124,12 @@ def recognise_path(given: Fetched) -> Format:
     """
     path = given.path
     try:
-        marked = (f for f in FORMATS if f.marker and (path / f.marker).is_file())
-        found = next(marked, None) or next((f for f in FORMATS if f.at is not None and f.at(path)), None)
+        folder = path if path.is_dir() or not path.exists() else path.parent
+        marked = [f for f in FORMATS if f.marker and (folder / f.marker).is_file()]
+        if folder == path:
+            found = next(iter(marked), None) or next((f for f in FORMATS if f.at is not None and f.at(path)), None)
+        else:  # a file of several that are one model
+            found = next((f for f in marked if f.at is not None and f.at(path)), None)
         if found is not None:
             return found
         if path.is_dir():

@@ -230,6 +230,8 @@ def _largest_move(exact: Array, moved: Sequence[Array]) -> Array:
     """How far the largest element of each row moved: float64 [rows]."""
     if exact.dtype.kind != "f":
         return np.zeros(len(exact))
-    steps = [np.abs(flat_rows(m).astype(np.float64) - flat_rows(exact)).max(axis=1, initial=0.0) for m in moved]
+    with np.errstate(invalid="ignore"):  # between two infinities
+        apart = [np.abs(flat_rows(m).astype(np.float64) - flat_rows(exact)) for m in moved]
+    steps = [np.nan_to_num(each, nan=0.0, posinf=np.inf).max(axis=1, initial=0.0) for each in apart]
     found: Array = np.nan_to_num(np.max(steps, axis=0), nan=0.0, posinf=0.0)
     return found.clip(0.0, BEYOND)

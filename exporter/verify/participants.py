@@ -25,6 +25,8 @@ from signatures.spec import PolicySignature, SourceMap
 if TYPE_CHECKING:
     from converters.policy.policy import Policy
     from exporter.verify.reference import Reference
+if not TYPE_CHECKING:  # what asks a record for its signature looks the name up
+    Policy = Any
 
 #: The runtime that takes longest to start, by far.
 _SLOWEST = "tensorflow"

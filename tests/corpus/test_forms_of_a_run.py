@@ -26,7 +26,7 @@ from exporter.verify.difference import compare
 from exporter.verify.tolerances import Tolerance, tolerance_for
 from signatures.errors import DamagedFileError, ExportModelError
 from signatures.roles import Role
-from signatures.sampling import FAR_CASES, draw_cases
+from signatures.sampling import FAR_CASES, HUGE_BATCH, draw_cases
 from tests.corpus.conftest import SHARED
 
 pytestmark = pytest.mark.corpus
@@ -139,7 +139,8 @@ def test_the_forms_of_a_run_are_one_policy(run: Path, is_new: Callable[[str, Seq
                 if case.name in _ROUNDED or not (every or case.name.startswith(_NEAR_NOISE)):
                     continue
                 ours, theirs = (run_graph(p.graph, case.feeds, names) for p in (mine, reference))
-                far = not case.name.startswith(_NEAR_NOISE)
+                # Of thousands of rows some saturate, too, where SAC's probabilities cancel.
+                far = not case.name.startswith(_NEAR_NOISE) or case.batch >= HUGE_BATCH
                 for name in names:
                     if far and reference.signature.output(name).role is Role.ACTION_PROBS:
                         continue
