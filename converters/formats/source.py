@@ -104,6 +104,7 @@ class ReadOptions(Struct, frozen=True):
       source; ``NO_NORMALISER``: they are left out).
     - ``script``: which script saved a state dictionary.
     - ``repair``: which fault of an ONNX model's exporter is mended.
+    - ``flags``: how the options begin on the command line, for errors.
     - ``interface``: the file that states the interface (None: those beside the source; "none": none).
     """
 
@@ -116,3 +117,4 @@ class ReadOptions(Struct, frozen=True):
     interface: str | None = None
     script: str | None = None
     repair: str | None = None
+    flags: str = "--"
