@@ -102,10 +102,7 @@ def _written(key: str, sample: Sample, path: str = "") -> bytes:
 
 
 def _tensorflow(sample: Sample) -> list[str]:
-    saved = schema.SavedModel.FromString(_written("saved_model", sample, "saved_model/saved_model.pb"))
-    frozen = schema.GraphDef.FromString(_written("bytes", sample))
-    assert {n.op for n in frozen.node} <= {n.op for n in saved.meta_graphs[0].graph_def.node}
-    return [n.op for n in frozen.node]
+    return [n.op for n in schema.GraphDef.FromString(_written("bytes", sample)).node]
 
 
 def _tfjs(sample: Sample) -> list[str]:
@@ -260,7 +257,7 @@ What each operation becomes, found by writing its samples, which the tests compa
 {SEVERAL} several.
 {REFUSED} refused, by name. `{SOME_SEVERAL}`: some forms take several. `{SOME_REFUSED}`: some are refused.
 
-*TensorFlow*: `.bytes` and SavedModel; *code*: C, C# and JavaScript, in nests of loops; *kernel*: this project's own, of
+*TensorFlow*: `.bytes`; *code*: C, C# and JavaScript, in nests of loops; *kernel*: this project's own, of
 the TensorFlow.js model. *Rounds*: {_PRECISIONS["exact"]} never, {_PRECISIONS["rounded"]} once, \
 {_PRECISIONS["summed"]} sums in any order, {_PRECISIONS["approximate"]} approximated (below).
 `_Fused…` are made of layers, for targets that have them.

@@ -141,7 +141,8 @@ def commands(given: Path, out: Path) -> Iterator[tuple[object, ...]]:
 
 
 def refused(ran: Ran, *, may_pass: bool = False) -> None:
-    assert ran.status in ((0, 2) if may_pass else (2,)), (ran.status, ran.out)
+    # A run's folder is read as a candidate, which numpy alone does not verify.
+    assert ran.status in ((0, 2, 3) if may_pass else (2,)), (ran.status, ran.out)
     assert "Traceback" not in ran.err + ran.out
     assert "did not expect" not in ran.err + ran.out
 
