@@ -216,6 +216,7 @@ def test_a_file_is_played_as_recorded(path: Path, row: dict[str, Any], unity_dat
 
 def test_every_row_names_models_that_were_played(unity_data: Path) -> None:
     played = {row["id"] for row in ROWS} | {row["id"] for row in lines("r3/minimal/rank2.jsonl")}
+    played |= {f"r4/{Path(row['source']).stem}" for row in lines("r4/played.jsonl")}
     named = {e.strip() for row in rows() for part in row.evidence.split(";") for e in part.split(",") if e.strip()}
     assert {e for e in named if not e.startswith("cases/")} <= played
     assert all((UNITY / "r3" / e).is_dir() for e in named if e.startswith("cases/"))

@@ -337,7 +337,7 @@ _BARRACUDA_OBSERVATIONS = (
         when=forms.misreads_entities,
         says="{name} is {shape}, which Barracuda lays out {entities}",
         fix="put Transpose (0, 2, 1) and Reshape [-1, {sensor_lengths}] right behind the input; --for {profile} does",
-        evidence="rank2_flat, rank2_per_entity, rank2_mul; cam_buffer of r4",
+        evidence="rank2_flat, rank2_per_entity, rank2_mul, r4/cam_buffer",
     ),
 )
 _BARRACUDA_MASKS = (
