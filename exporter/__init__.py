@@ -1,4 +1,4 @@
-"""export-model: trained Unity ML-Agents policies for every runtime, proven to act the same.
+"""export-model: trained policies for every runtime, proven to act the same.
 
 ``import export_model`` is what users import; ``from exporter import export_model, …`` has the same with flat keywords.
 Nothing heavy is imported before it is used: a cold start is a feature.

@@ -129,7 +129,7 @@ HELD = (
     r"ML-Agents 0\.1 to 1\.1",  # test_the_words_of_readme…
     r"Python 3\.11 to 3\.13 with `venv`, and Node 20: what the tests run on; pip installs it on 3\.14",
     r"Apache-2\.0",
-    r"3DBall|Stable-Baselines3|float32",
+    r"3DBall|Stable-Baselines3|float32|`model_1500\.pt`|`export-model model_1500\.pt --to c`|--for unity6",
 )
 
 

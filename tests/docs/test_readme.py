@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -44,3 +45,13 @@ def test_the_commands_of_the_readme_are_goals_of_the_makefile(make: str) -> None
     for goal in goals:
         done = subprocess.run([make, "--dry-run", goal], cwd=ROOT, capture_output=True, check=False)
         assert done.returncode == 0, goal
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/start.md"])
+def test_what_is_installed_is_what_there_is_to_install(page: str) -> None:
+    """Before the first release no registry has the name, so a reader installs the clone."""
+    tool = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]
+    text = (ROOT / page).read_text(encoding="utf-8")
+    first = next(line for line in text.splitlines() if line.startswith("pip install"))
+    name = "export-model" if tool["export-model"]["published"] else "."
+    assert first.split("#")[0].split() == ["pip", "install", f'"{name}[onnxruntime]"']
