@@ -17,6 +17,7 @@ _COMMANDS = (
     "play",
     "runtimes",
     "serve",
+    "skill",
     "snippets",
     "verify",
 )

@@ -24,7 +24,7 @@ PROGRAM = "export-model"
 PATH, FILE = click.Path(path_type=Path), click.Path(path_type=Path, dir_okay=False)
 _OWN = frozenset(("--help", "-h", "--help-all", "--version"))
 #: Commands that ``--help`` leaves to ``--help-all``.
-_RARE = frozenset(("card", "completion", "consumers"))
+_RARE = frozenset(("card", "completion", "consumers", "skill"))
 
 
 #: Title of a group of options → their parameters, in the order of the help.
