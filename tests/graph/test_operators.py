@@ -61,6 +61,23 @@ def test_the_page_is_that_of_the_samples(processes: RuntimePool) -> None:
     assert operators.PAGE.read_text(encoding="utf-8") == operators.page(processes)
 
 
+def test_each_row_of_the_saved_model_is_needed() -> None:
+    """The op's samples have each of the other ops, and no op has a row whose SavedModel is the ``.bytes``."""
+    for op, (less, more) in operators.IN_SAVED_MODEL.items():
+        lost, gained = set[str](), set[str]()
+        for sample, _ in operators.samples_of(op):
+            mine, theirs = operators.tensorflow_ops(sample)
+            lost |= (mine - theirs).keys()
+            gained |= (theirs - mine).keys()
+        assert (lost, gained) == (less, more), op
+
+
+def test_an_op_that_a_saved_model_has_otherwise_needs_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(operators, "IN_SAVED_MODEL", {})
+    with pytest.raises(AssertionError, match="OneHot"):
+        list(outcomes("OneHot", "TensorFlow"))
+
+
 def test_a_kernel_that_is_not_there_is_a_refusal(processes: RuntimePool, tmp_path: Path) -> None:
     """A page runs every model of ours but those that are not written."""
     found = {op: cell(operators.kernel_outcomes(op, processes, tmp_path)) for op in ("Tanh", "Where")}
