@@ -57,6 +57,26 @@ def chosen_runtimes(
     return tuple(dict.fromkeys(["numpy", *names])), infos
 
 
+def unverified_error(
+    formats: Iterable[Format], used: Sequence[str], infos: Iterable[RuntimeInfo], where: str | None = None
+) -> RuntimeUnavailableError:
+    """Return the error that no independent runtime ran a file of ``formats``: none was asked for, or none is here."""
+    kinds = list(formats)
+    fitting = {name for form in kinds for name in form.runtimes}.intersection(INDEPENDENT)
+    known = sorted((i for i in infos if i.name in fitting and i.supported), key=lambda i: i.name != "onnxruntime")
+    here = [i.name for i in known if i.installed]
+    if here:
+        state, remedy = "was asked for", f"--runtimes {here[0]}"
+    else:
+        state, remedy = "is installed", known[0].how if known else "export-model runtimes says how to install one"
+    return RuntimeUnavailableError(
+        f"no independent runtime {state}, so nothing was compared",
+        where=where,
+        why=f"{', '.join(used)} alone took part; {kinds[0].label} runs in {', '.join(i.name for i in known) or 'none'}",
+        fix=f"{remedy}, or --allow-unverified",
+    )
+
+
 class RuntimePool(AbstractContextManager["RuntimePool"]):
     """Hands out a process per runtime; ``commands`` starts them, by name (the registry's where it is not given)."""
 

@@ -25,7 +25,7 @@ from converters.files.folders import scratch_folder, size_of
 from converters.formats.source import OriginalRun, ReadOptions
 from converters.interfaces.differences import interface_differences
 from converters.policy.policy import Policy
-from converters.runtimes.pool import RuntimePool, chosen_runtimes
+from converters.runtimes.pool import RuntimePool, chosen_runtimes, unverified_error
 from exporter.compare.explaining import Explaining
 from exporter.compare.matching import AnyCandidate, Candidate, match_candidates
 from exporter.compare.reading import ReadCandidate, read_participants
@@ -52,7 +52,7 @@ from exporter.verify.report import ParityReport
 from exporter.verify.session import Session
 from exporter.verify.tolerances import Tolerance, check_rules
 from exporter.verify.verification import CHECKS, Judge, verify
-from signatures.errors import RuntimeUnavailableError, UsageError, naming
+from signatures.errors import UsageError, naming
 from signatures.sampling import draw_cases
 
 _LOG = logging.getLogger(__name__)
@@ -123,11 +123,7 @@ def compare_artefacts(
         report, notes=(*report.notes, *notes, *explaining.notes), self_consistent=report.self_consistent and not ran
     )
     if report.passed is None and not report.undecided and not (options.allow_unverified or judging.runtimes == "none"):
-        raise RuntimeUnavailableError(
-            "no runtime that runs the candidates is installed, so nothing was compared",
-            why=f"they are {', '.join(sorted({m.format.key for m in matched}))}",
-            fix="export-model runtimes lists the runtimes and how to install each; or --allow-unverified",
-        )
+        raise unverified_error([form for m in matched for form in m.forms], used, known)
     return report
 
 

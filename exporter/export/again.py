@@ -19,7 +19,7 @@ from converters.formats.saved_model.writer import signatures_of
 from converters.formats.source import NO_NORMALISER, OriginalRun, ReadOptions
 from converters.graph.nodes import Graph, Node, TensorShape
 from converters.policy.policy import Policy
-from converters.runtimes.pool import RuntimePool, chosen_runtimes
+from converters.runtimes.pool import RuntimePool, chosen_runtimes, unverified_error
 from exporter.export.job import Job, own_in, runs_elsewhere
 from exporter.export.options import storage_of
 from exporter.export.pipeline import Progress, consumer, join_reports
@@ -35,7 +35,7 @@ from exporter.verify.verdict import reference_text
 from exporter.verify.verification import verify
 from signatures.code import CodeOptions
 from signatures.contract import POLICY, Contract
-from signatures.errors import BundleError, RuntimeUnavailableError, UsageError, naming
+from signatures.errors import BundleError, UsageError, naming
 from signatures.fields import printable
 from signatures.roles import Role
 from signatures.spec import PolicySignature
@@ -138,15 +138,15 @@ def verify_folder(
         report = replace(report, reference=f"{own.key}/{KERNELS}", self_consistent=False)
         report = _with_note(report, f"the source was not given: the reference is {reference_text(report)}")
     report = replace(report, played=read_plays(folder))
-    return _unless_unverified(report, case, required=not (allow_unverified or runtimes == "none"))
+    return _unless_unverified(report, case, None if allow_unverified or runtimes == "none" else runtimes)
 
 
 def _with_note(report: ParityReport, note: str) -> ParityReport:
     return replace(report, notes=(*report.notes, note))
 
 
-def _unless_unverified(report: ParityReport, case: _Case, *, required: bool) -> ParityReport:
-    """Return the report; raise RuntimeUnavailableError where no independent runtime ran and one is ``required``."""
+def _unless_unverified(report: ParityReport, case: _Case, required: str | Sequence[str] | None) -> ParityReport:
+    """Return the report; raise RuntimeUnavailableError where no independent runtime ran of those ``required``."""
     (first, *others) = case.formats
     if report.passed is not None:
         return report
@@ -157,16 +157,8 @@ def _unless_unverified(report: ParityReport, case: _Case, *, required: bool) -> 
             f"only {first.elsewhere} runs a .{first.key}: its bytes, its contract and that it answers by our own "
             "reader were verified",
         )
-    if required and not report.undecided:
-        from exporter.reports.summary import to_verify
-
-        install = to_verify(report) or "export-model runtimes says how to install one"
-        raise RuntimeUnavailableError(
-            "no independent runtime is installed, so nothing was verified",
-            where=str(case.bundle.folder),
-            why="only the numpy reference ran",
-            fix=f"{install}, or --allow-unverified",
-        )
+    if required is not None and not report.undecided:
+        raise unverified_error(case.formats, *chosen_runtimes(required, case.formats), str(case.bundle.folder))
     return report
 
 

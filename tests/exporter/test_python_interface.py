@@ -163,7 +163,7 @@ def test_a_bundle_is_verified_again(tmp_path: Path) -> None:
     assert isinstance(report, ParityReport)
     assert (report.passed, report.policy, report.reference) == (None, "continuous", "bytes/numpy")
     assert any("the source was not given" in note for note in report.notes)
-    with pytest.raises(RuntimeUnavailableError, match="nothing was verified"):
+    with pytest.raises(RuntimeUnavailableError, match="nothing was compared"):
         verify_bundle(str(result.folder), runtimes=["numpy"])
     with_source = verify_bundle(result.folder, source=str(BALL), runtimes="numpy", allow_unverified=True)
     assert with_source.reference == "numpy"

@@ -15,7 +15,7 @@ from converters.files.children.process import RunFailedError, RuntimeProcess
 from converters.formats.registry import DEFAULTS, WRITTEN
 from converters.runtimes import pool as pools
 from converters.runtimes.javascript import node as javascript
-from converters.runtimes.pool import RuntimePool, chosen_runtimes
+from converters.runtimes.pool import RuntimePool, chosen_runtimes, unverified_error
 from converters.runtimes.registry import RUNTIMES, RuntimeInfo
 from fixtures import path as fixture
 from signatures.errors import RuntimeUnavailableError, UsageError
@@ -95,6 +95,29 @@ def test_names_that_are_none_or_not_installed_are_refused(here: set[str]) -> Non
 def test_what_is_known_is_told_whatever_is_chosen(here: set[str]) -> None:
     for wanted in ("none", "auto", "numpy"):
         assert [info.name for info in chosen_runtimes(wanted, [WRITTEN["onnx"]])[1]] == list(NAMES)
+
+
+def test_the_error_names_runtimes_that_are_here_but_were_not_asked(here: set[str]) -> None:
+    """What is installed is never called missing, and a format that this error does not name gives no remedy."""
+
+    def error(runtimes: str, *formats: str) -> RuntimeUnavailableError:
+        forms = [WRITTEN[f] for f in formats]
+        return unverified_error(forms, *chosen_runtimes(runtimes, forms))
+
+    asked = error("numpy", "onnx")
+    assert (asked.what, asked.fix) == (
+        "no independent runtime was asked for, so nothing was compared",
+        "--runtimes onnxruntime, or --allow-unverified",
+    )
+    assert "numpy alone took part; an ONNX model runs in onnxruntime" in (asked.why or "")
+    assert "--runtimes tfjs-cpu, or" in (error("numpy", "tfjs").fix or "")
+    here -= {"onnxruntime"}
+    missing = error("auto", "onnx")
+    assert (missing.what, missing.fix) == (
+        "no independent runtime is installed, so nothing was compared",
+        "get onnxruntime, or --allow-unverified",
+    )
+    assert "runtimes says how" in (error("auto", "nn").fix or "")
 
 
 # ------------------------------------------------------------------ processes

@@ -71,7 +71,7 @@ class Bundle(Struct, frozen=True):
         path = folder / POLICY
         try:
             if _file_size(path) > _MOST_BYTES:
-                raise unfit(path, "is too large", "no contract is")
+                raise unfit(path, "is too large", f"a contract has at most {_MOST_BYTES >> 20} MiB")
             content = json_of(path.read_bytes())
             contract = parse(content)
         except (FileNotFoundError, NotADirectoryError) as error:
