@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import pytest
 
 from converters.files.fetch import Fetched
@@ -174,6 +175,33 @@ def test_without_an_optimizer_a_note_says_what_is_assumed(tmp_path: Path) -> Non
     for tensors, assumed in ((sac(), True), (actor(), False)):
         (policy,) = read_source(placed(tmp_path, tensors)).policies()
         assert any("tanh is taken to bound" in note for note in policy.signature.notes) == assumed
+
+
+@pytest.mark.parametrize("squashed", [True, False], ids=("tanh", "a clip"))
+@pytest.mark.parametrize("saved", [{}, {"Optimizer:entropy_optimizer": {}}, {"Optimizer:value_optimizer": {}}], ids=str)
+@pytest.mark.parametrize("conditional", [True, False], ids=("depends", "free"))
+def test_the_onnx_beside_says_what_bounds_the_action(
+    conditional: bool, saved: dict[str, Any], squashed: bool, tmp_path: Path
+) -> None:
+    """ML-Agents writes one with each checkpoint; its own trainers, told by their optimizers, need none."""
+    path = tmp_path / "a.pt"
+    path.write_bytes(checkpoint(sac() if conditional else actor(), **saved))
+    nodes = [onnx.helper.make_node("Tanh" if squashed else "Clip", ["x"], ["y"])]
+    path.with_suffix(".onnx").write_bytes(
+        onnx.helper.make_model(onnx.helper.make_graph(nodes, "g", [], [])).SerializeToString()
+    )
+    own = bool(saved) and conditional == ("Optimizer:entropy_optimizer" in saved)
+    (policy,) = read_source(path).policies()
+    assert any(n.op == "Tanh" for n in policy.graph.nodes) == (conditional if own else squashed)
+    said = [n for n in policy.signature.notes if "bound" in n]
+    assert own != any(f"a.onnx, beside it, says that {'tanh' if squashed else 'a clip'}" in n for n in said), said
+    path.with_suffix(".onnx").write_bytes(b"\x3a\xff")  # of no nodes: it says nothing
+    if own or not saved:
+        (policy,) = read_source(path).policies()
+        assert any(n.op == "Tanh" for n in policy.graph.nodes) == conditional
+    else:
+        with pytest.raises(SourceError, match="a clip, or tanh"):
+            read_source(path)
 
 
 def test_an_action_whose_bound_is_not_known_is_refused(tmp_path: Path) -> None:

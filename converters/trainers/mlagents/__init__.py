@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from converters.trainers.mlagents.policy import to_graph
+from converters.trainers.mlagents.policy import rebuild
 from converters.trainers.mlagents.state import State, actor_in
 from converters.trainers.trainer import Rebuilt, Saved, Trainer
 
 
 def _rebuild(saved: Saved, policy: Mapping[Any, Any]) -> Rebuilt:
     saved.refuse_activation("ML-Agents", "its networks have Swish")
-    return Rebuilt(*to_graph(State(saved.archive, policy), saved.sensors, saved.goals))
+    return rebuild(State(saved.archive, policy), saved.given, saved.sensors, saved.goals)
 
 
 TRAINER = Trainer("ML-Agents", lambda saved: actor_in(saved.value), _rebuild)

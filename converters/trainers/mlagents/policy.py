@@ -14,7 +14,7 @@ before 0.30. What the weights say of a generation:
 
 What they do not say is fixed: the activation (Swish), the clip of a continuous action (±3, divided by 3) for PPO and
 POCA (none at all in 0.20 and 0.21), tanh for SAC, which alone has a deviation that depends on the observation
-(``log_sigma.weight``).
+(``log_sigma.weight``); bound.py says what decides where they contradict each other.
 """
 
 from __future__ import annotations
@@ -25,18 +25,19 @@ from collections.abc import Sequence
 import numpy as np
 from msgspec import Struct
 
+from converters.files.fetch import Fetched
 from converters.graph.nn.activations import clip, leaky_relu, swish
-from converters.graph.nodes import Graph
 from converters.policy.facts import SourceFacts
 from converters.policy.generations import SAC_MEAN, TORCH_VERSION_3
 from converters.policy.rules import Decision
 from converters.trainers.mlagents.body import attend, body_width, goal_width, hidden_layers
+from converters.trainers.mlagents.bound import Bound, find_bound, trainer_of
 from converters.trainers.mlagents.sensors import Sensor, dense_name, encoder_of, find_goals, find_sensors
-from converters.trainers.mlagents.state import LET_IT_EXPORT, State
+from converters.trainers.mlagents.state import State
 from converters.trainers.pytorch.activations import LEAKY_SLOPE
 from converters.trainers.pytorch.network import Network
 from converters.trainers.pytorch.weights import pytorch_alone
-from signatures.errors import SourceError
+from converters.trainers.trainer import Rebuilt
 from signatures.roles import (
     ACTION_SHAPE,
     CONTINUOUS_SHAPE,
@@ -113,8 +114,8 @@ def _generation(state: State) -> _Generation:
     return _Generation(span, version, lists, body, encoder, *heads, preview=preview and heads[0] == "distribution")
 
 
-def to_graph(state: State, told: Sequence[tuple[int, ...]], goals: Sequence[int] = ()) -> tuple[Graph, SourceFacts]:
-    """The policy and what is known of it.
+def rebuild(state: State, given: Fetched, told: Sequence[tuple[int, ...]], goals: Sequence[int] = ()) -> Rebuilt:
+    """The policy of the checkpoint ``given`` and what is known of it.
 
     ``told`` are the shapes of the sensors, where the user gives them, ``goals`` the places of those that are goals.
     Raises SourceError and its kinds, UsageError.
@@ -134,53 +135,29 @@ def to_graph(state: State, told: Sequence[tuple[int, ...]], goals: Sequence[int]
         x, memory = net.lstm(x, net.input("recurrent_in", 1, size), f"{_BODY}.lstm.lstm")
     net.fact(VERSION_NUMBER, np.array([generation.version]))
     net.fact(MEMORY_SIZE, np.array([0 if memory is None else net.width(memory)]))
-    names, conditional = _actions(net, generation, x)
-    trainer = _trainer(state, conditional)
+    bound = find_bound(state, given, generation.continuous)
+    names = _actions(net, generation, x, squashed=bound.squashed)
     if memory is not None:
         net.output("recurrent_out", memory)
         names.append("recurrent_out")
     state.check_all_read()
     facts = SourceFacts(
         family=f"ML-Agents {generation.span} (PyTorch)",
-        algorithm=trainer,
+        algorithm=trainer_of(state),
         image_layout="NCHW",
         memory_layout=() if memory is None else ("h", "c"),
         outputs=dict.fromkeys((VERSION_NUMBER, MEMORY_SIZE, *names)),
-        notes=tuple(_notes(generation, sensors, joined, squashed=conditional, guessed=trainer is None)),
+        notes=tuple(_notes(generation, sensors, joined, bound)),
         decisions=_reasons(generation, sensors),
     )
-    return net.graph(), facts
+    return Rebuilt(net.graph(), facts, bound.files)
 
 
-def _trainer(state: State, conditional: bool | None) -> str | None:
-    """Which trainer saved the checkpoint, by its optimizers' names; None where none is saved with it.
-
-    ``conditional``: whether the deviation depends on the observation (None: no continuous action). Raises SourceError
-    where both contradict each other: whether tanh or a clip bounds the action is known of ML-Agents' trainers only.
-    """
-    optimizers = {m.removeprefix("Optimizer").removeprefix(":") for m in state.modules if m.startswith("Optimizer")}
-    if not optimizers:
-        return None
-    trainer = "SAC" if "entropy_optimizer" in optimizers else "POCA" if "adam" in optimizers else "PPO"
-    if conditional is not None and conditional != (trainer == "SAC"):
-        raise SourceError(
-            "the checkpoint does not tell what bounds its continuous action: a clip, or tanh",
-            why=f"its optimizers ({', '.join(sorted(optimizers))}) and its deviation are of different trainers; "
-            "a plugin may have trained it",
-            fix=LET_IT_EXPORT,
-        )
-    return trainer
-
-
-def _notes(
-    generation: _Generation, sensors: Sequence[Sensor], joined: bool, *, squashed: bool | None, guessed: bool
-) -> list[str]:
+def _notes(generation: _Generation, sensors: Sequence[Sensor], joined: bool, bound: Bound) -> list[str]:
     notes = [pytorch_alone("ML-Agents", "a checkpoint")]
-    if squashed and generation.by_sensor:
+    if bound.squashed and generation.by_sensor:
         notes.append(SAC_MEAN)
-    if squashed is not None and guessed:
-        whose, bound = ("depends", "SAC's alone does: tanh") if squashed else ("does not depend", "PPO's: a clip")
-        notes.append(f"its deviation {whose} on the observation, as {bound} is taken to bound its action")
+    notes.extend(bound.notes)
     vectors = [s for s in sensors if len(s.shape) == 1 and not s.places]
     if vectors and (joined or (not generation.by_sensor and (len(vectors) > 1 or len(generation.lists) > 1))):
         size = sum(s.shape[0] for s in vectors)
@@ -300,17 +277,12 @@ def _resnet(net: Network, image: str, module: str) -> str:
 # ------------------------------------------------------------------ actions
 
 
-def _actions(net: Network, generation: _Generation, x: str) -> tuple[list[str], bool | None]:
-    """The outputs that act, by the names of the generation; and whether the deviation depends on the observation.
-
-    The deviation is that of the continuous ones (None: there are none). Where it depends, they are SAC's, and tanh
-    bounds them.
-    """
+def _actions(net: Network, generation: _Generation, x: str, *, squashed: bool) -> list[str]:
+    """The outputs that act, by the names of the generation; the continuous ones are ``squashed`` by tanh, as SAC's."""
     names: list[str] = []
-    squashed: bool | None = None
     made: dict[str, str] = {}
     if f"{generation.continuous}.mu.weight" in net.state:
-        mean, draw, squashed = net.gaussian(x, generation.continuous)
+        mean, draw = net.gaussian(x, generation.continuous)
         if squashed:
             value = net.add("Tanh", [draw])
         else:
@@ -341,7 +313,7 @@ def _actions(net: Network, generation: _Generation, x: str) -> tuple[list[str], 
         net.fact(IS_CONTINUOUS, np.array([kind == "continuous"]))
         net.fact(ACTION_SHAPE, np.array([net.width(value)]))
         names = ["action", IS_CONTINUOUS, ACTION_SHAPE, *names]
-    return names, squashed
+    return names
 
 
 def _discrete(net: Network, generation: _Generation, x: str, branches: Sequence[str]) -> tuple[str, list[int]]:

@@ -173,12 +173,11 @@ class Network(Builder):
 
     # ------------------------------------------------------------------ distributions
 
-    def gaussian(self, x: str, module: str) -> tuple[str, str, bool]:
-        """``GaussianDistribution``: the mean and a draw, both [B, A], and whether the deviation depends on x (SAC)."""
+    def gaussian(self, x: str, module: str) -> tuple[str, str]:
+        """``GaussianDistribution``: the mean and a draw, both [B, A]; the deviation may depend on x, as SAC's does."""
         mean = self.linear(x, f"{module}.mu")
         actions = self.width(mean)
-        conditional = f"{module}.log_sigma.weight" in self.state
-        if conditional:
+        if f"{module}.log_sigma.weight" in self.state:
             log_sigma = clip(self, self.linear(x, f"{module}.log_sigma", actions), -20, 2)
         else:
             self.at(f"{module}.log_sigma")
@@ -186,7 +185,7 @@ class Network(Builder):
         self.at(module)
         noise = self.normals_like(mean, self.prefix)
         spread = self.add("Mul", [noise, self.add("Exp", [log_sigma])])
-        return mean, self.add("Add", [mean, spread]), conditional
+        return mean, self.add("Add", [mean, spread])
 
     def normals_like(self, mean: str, module: str) -> str:
         """Draws from N(0, 1), one for each number of ``mean``; ``module`` is whose, as reports of lifted noise say."""
