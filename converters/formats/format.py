@@ -121,6 +121,7 @@ class Ports(Struct, frozen=True):
     """What an artefact takes and gives, whichever tool made it; ``path`` and ``options`` are what its loader takes.
 
     ``open`` is set where any node can be asked for (a frozen graph): ``outputs`` are then all nodes that can be.
+    ``left_out`` are outputs of its policy that it was written without.
     """
 
     path: Path
@@ -128,6 +129,7 @@ class Ports(Struct, frozen=True):
     outputs: tuple[Port, ...]
     options: Mapping[str, Any] = field(default_factory=dict)
     open: bool = False
+    left_out: tuple[str, ...] = ()
 
 
 class Member(Struct, frozen=True):

@@ -55,7 +55,7 @@ class Candidate(Struct, frozen=True):
     #: outputs that the candidate draws, because it makes the noise that the reference is fed
     drawn: frozenset[str]
     problems: tuple[Problem, ...]
-    #: outputs that export-model made for the reference, and that this one has none of
+    #: outputs that export-model made for the reference, and this one has none of, or that it was written without
     missing_ok: tuple[str, ...] = ()
     #: what the file states of its numbers
     interface: Interface | None = None
@@ -311,8 +311,7 @@ def _match(
     lacking = [s for s in signature.inputs if s.name not in inputs]
     noise = frozenset(s.name for s in lacking if s.role is Role.NOISE)
     drawn = frozenset(policy.graph.descendants(noise).intersection(found))
-    # What was made for the reference may be missing where all of it is: then the candidate is of another maker.
-    missing_ok = tuple(sorted(made - set(found))) if found and not made & set(found) else ()
+    missing_ok = _may_lack(own, found, made, signature.outputs)
     for spec in signature.outputs:
         if spec.name not in found and spec.name not in missing_ok:
             text = f"missing output {aliases[spec.name][0]!r}; there are {_names(own.outputs)}"
@@ -343,6 +342,18 @@ def _match(
         problems=tuple(problems),
         missing_ok=missing_ok,
     )
+
+
+def _may_lack(
+    own: Ports, found: Mapping[str, Port], made: frozenset[str], outputs: Sequence[TensorSpec]
+) -> tuple[str, ...]:
+    """Outputs that may be missing: what the candidate was written without; all of what was made for the reference.
+
+    Where all of that is missing, the candidate is of another maker. One that has no output may lack none.
+    """
+    others_make = not made & set(found)
+    able = {*own.left_out, *(made if others_make else ())}
+    return tuple(sorted(s.name for s in outputs if s.name in able and s.name not in found)) if found else ()
 
 
 def _names(ports: Sequence[Port]) -> str:

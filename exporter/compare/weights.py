@@ -12,23 +12,37 @@ from pathlib import Path
 from msgspec.structs import replace
 
 from converters.compiler.passes.weights import Storage, round_weights
+from converters.files.fetch import Fetched
 from converters.formats.bundle.bundle import Bundle
+from converters.formats.recognise import recognise_path
 from converters.policy.policy import Policy
 from exporter.export.options import storage_of
 from exporter.verify.checks.decisions import decisions
 from exporter.verify.participants import PolicyUnderTest, write_reference
 from exporter.verify.report import ParityReport
 from exporter.verify.session import Session
-from signatures.contract import POLICY
+from signatures.contract import POLICY, Contract, json_of, parse
+from signatures.errors import naming
 
 
 def rounded_to(path: Path) -> Storage | None:
-    """Return what the weights of a bundle, or of a file in one, were rounded to, as its policy.json says; else None."""
+    """Return what the weights of a bundle or of a file of one were rounded to, as its contract says; else None.
+
+    That is the policy.json near it, else the copy that the file embeds. Raises FieldError, BundleError, SourceError.
+    """
     folder = next((f for f in (path, *path.absolute().parents[:2]) if (f / POLICY).is_file()), None)
-    if folder is None:
-        return None
-    weights = Bundle.open(folder).contract.tool.get("weights")
+    contract = _embedded_contract(path) if folder is None else Bundle.open(folder).contract
+    weights = contract and contract.tool.get("weights")
     return storage_of(str(weights)) if weights else None
+
+
+def _embedded_contract(path: Path) -> Contract | None:
+    kind = recognise_path(Fetched(path))
+    if kind.held is None:
+        return None
+    with naming(path):
+        content = kind.held(path)
+        return None if content is None else parse(json_of(content) if isinstance(content, str | bytes) else content)
 
 
 def compare_rounded(

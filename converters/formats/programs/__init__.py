@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import TYPE_CHECKING
 
 from converters.formats.format import Format, WriteOptions, defer_imports
@@ -24,6 +25,8 @@ def program_format(
     return Format(
         key=key,
         label=label,
+        advice="it is written and run, never read: give the model that it was exported from (compare takes it second)",
+        sniff=partial(_artifact.is_program, suffix),
         write=write,
         main=f"{{name}}{suffix}",
         beside=WEIGHTS_FILE,

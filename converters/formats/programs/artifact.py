@@ -8,6 +8,7 @@ from pathlib import Path
 
 from converters.files.children.confinement import in_force
 from converters.files.fetch import read_bytes
+from converters.files.file_probe import Content
 from converters.formats.format import Port, Ports
 from converters.formats.programs.comment import LINE, interface_lines
 from converters.formats.programs.members import answers
@@ -20,6 +21,11 @@ from signatures.spec import PolicySignature
 #: What a file's ending says of its format.
 WRITTEN_AS = {".h": "c", ".cs": "csharp", ".mjs": "js"}
 _MARK = f"   {EMBEDDED}: ".encode()
+
+
+def is_program(suffix: str, file: Content) -> bool:
+    """Whether a file is source code that export-model wrote: its contract says so, its ending in which language."""
+    return file.text is not None and file.name.endswith(suffix) and _MARK in file.data
 
 
 def held(path: Path) -> str | None:
@@ -58,6 +64,7 @@ def ports(path: Path) -> Ports:
         tuple(Port(s.name, s.dtype, s.shape) for s in signature.inputs),
         tuple(Port(s.name, s.dtype, s.shape) for s in signature.outputs if s.name in wanted),
         {"kind": "graph", "format": WRITTEN_AS[path.suffix]},
+        left_out=tuple(s.name for s in signature.outputs if s.name not in wanted),
     )
 
 
@@ -74,8 +81,9 @@ def vetted(path: Path, names: Sequence[str], folder: Path) -> Path:
             fix="verify it on Linux 5.13 or later, or export the policy again, which verifies it",
         )
     ports(path)
-    if CodeOptions.of(contract_held(path).tool).weights == "file":
-        weights = path.with_name(weights_name(path.stem))
+    contract = contract_held(path)
+    if CodeOptions.of(contract.tool).weights == "file":
+        weights = path.with_name(weights_name(contract.name))
         if not weights.is_file():
             raise DamagedFileError(
                 f"{weights.name} is missing", why=f"{path.name} loads it", fix="keep both in one folder"

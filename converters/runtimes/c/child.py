@@ -133,10 +133,10 @@ class _Library:
     def __init__(self, path: Path, seed: int, build: _Builder) -> None:
         contract = contract_held(path)
         code = CodeOptions.of(contract.tool)
-        self.header, self.branches = header_of(path.stem, contract.signature, code), contract.signature.branches
+        self.header, self.branches = header_of(contract.name, contract.signature, code), contract.signature.branches
         self.library = ctypes.CDLL(str(build(self.header, code, self.branches, path)))
         if code.weights == "file":
-            file = path.with_name(weights_name(path.stem)).read_bytes()
+            file = path.with_name(weights_name(contract.name)).read_bytes()
             self.weights = np.frombuffer(
                 file, np.uint8
             ).copy()  # numpy aligns what it makes; the library reads it there

@@ -184,10 +184,10 @@ class _Program:
     def __init__(self, path: Path, seed: int, folder: Path, compiler: str, mono: str) -> None:
         contract = contract_held(path)
         code = CodeOptions.of(contract.tool)
-        self.header, self.branches = header_of(path.stem, contract.signature, code), contract.signature.branches
+        self.header, self.branches = header_of(contract.name, contract.signature, code), contract.signature.branches
         own = Path(tempfile.mkdtemp(dir=folder))
         if code.weights == "file":
-            shutil.copyfile(path.with_name(weights_name(path.stem)), own / "weights.bin")
+            shutil.copyfile(path.with_name(weights_name(contract.name)), own / "weights.bin")
         shutil.copyfile(path, own / "policy.cs")
         (own / "driver.cs").write_text(driver(self.header, code, self.branches), "ascii")
         size = path.stat().st_size

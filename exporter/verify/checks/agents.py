@@ -66,7 +66,7 @@ class _Played:
         contract = contract_held(participant.path)
         self.trial, self.participant, self.signature = trial, participant, contract.signature
         self.code = CodeOptions.of(contract.tool)
-        self.header: Header = header_of(participant.path.stem, contract.signature, self.code)
+        self.header: Header = header_of(contract.name, contract.signature, self.code)
         self.chosen = self.header.choice_field(self.signature.branches)
         called = [n for n in participant.outputs if trial.is_drawn(n, participant)]
         self.drawn = [n for n in called if trial.signature.output(n).batched]
