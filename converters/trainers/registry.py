@@ -15,6 +15,7 @@ ROOMS = (
     "rllib",
     "stable_baselines3",
     "mlagents",
+    "fast_td3",
     "rsl_rl",
     "rl_games",
     "skrl",

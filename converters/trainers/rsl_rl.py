@@ -16,7 +16,6 @@ from msgspec.structs import replace
 
 from converters.graph.nn.activations import Activation
 from converters.graph.nodes import Graph
-from converters.graph.types import FLOAT32
 from converters.policy.facts import SourceFacts
 from converters.trainers.pytorch.activations import activation_of
 from converters.trainers.pytorch.network import Network
@@ -26,8 +25,6 @@ from signatures.roles import Role
 
 _USUAL = "rsl_rl's default is elu"
 _EXPORT_ONNX = "export the policy to ONNX in its own project (rsl_rl's exporter, torch.onnx.export), and give that"
-#: Added to the deviation by ``EmpiricalNormalization``.
-_EPSILON = 1e-2
 _NORMALISER = "obs_norm"
 
 
@@ -74,7 +71,7 @@ def _to_graph(archive: TensorFile, layout: _Layout, activation: Activation) -> t
     first = f"{layout.memory}.weight_ih_l0" if recurrent else f"{layout.actor}.0.weight"
     x = net.input("obs", weights.length(first, 1))
     for module in (layout.normaliser, _NORMALISER):
-        x = _normalise(net, x, module)
+        x = net.empirical(x, module)
     memory: tuple[str, ...] = ()
     if recurrent:
         x, memory = net.remembering(x, layout.memory)
@@ -94,21 +91,6 @@ def _to_graph(archive: TensorFile, layout: _Layout, activation: Activation) -> t
         ),
     )
     return net.graph(), facts
-
-
-def _normalise(net: Network, x: str, module: str) -> str:
-    """``EmpiricalNormalization``: (x − mean) / (deviation + 0.01); x where there is none."""
-    state = net.state
-    if f"{module}._mean" not in state:
-        return x
-    mean, deviation = (
-        state.array(f"{module}.{k}", *(1,) * (len(state.shape(f"{module}.{k}")) - 1), net.width(x)).reshape(-1)
-        for k in ("_mean", "_std")
-    )
-    state.forget(f"{module}._var", f"{module}.count")
-    net.at(module)
-    centred = net.add("Sub", [x, net.const(mean, "mean")])
-    return net.add("RealDiv", [centred, net.const((deviation + FLOAT32.type(_EPSILON)).astype(FLOAT32), "deviation")])
 
 
 def _deviation(net: Network, mean: str, layout: _Layout) -> dict[str, Role]:

@@ -41,10 +41,14 @@ def checkpoint(
     if name.startswith("sample_factory_"):
         place = place.replace("nn/last.pth", "checkpoint_p0/checkpoint_000000978_4005888.pth")
         settings = settings.replace("params/", "").replace("agent.yaml", "config.json")
+    if name.startswith("fast_td3_"):
+        settings = ""
     writer = Writer()
     path = folder / place
     path.parent.mkdir(parents=True, exist_ok=True)
     beside = {"epoch": 3, "frame": 9, "last_mean_rewards": RETURNS}
+    if not settings:
+        beside["args"] = yaml.safe_load((FOLDER / f"{name}.yaml").read_text())
     path.write_bytes(writer.zip({**{k: writer.state(s) for k, s in states(name).items()}, **beside}))
     if settings:
         (folder / settings).parent.mkdir(parents=True, exist_ok=True)

@@ -355,3 +355,34 @@ class Command:
 
     def __reduce__(self) -> tuple[Any, ...]:
         return os.system, (self.text,)
+
+
+# ------------------------------------------------------------------ FastTD3
+
+
+@pytest.mark.parametrize(
+    ("name", "tensor", "args", "message"),
+    [
+        ("fast_td3_plain", ("task_embedding.weight", (4, 3)), {}, "an actor of several tasks"),
+        ("fast_td3_plain", ("net.4.weight", (3, 16)), {}, "no net.4.bias"),
+        ("fast_td3_plain", ("extra.weight", (3, 3)), {}, "extra.weight"),
+        ("fast_td3_simplices", None, {"actor_seq_len": 7}, "actor_seq_len=7 groups"),
+        ("fast_td3_simplices", None, {"actor_seq_len": "6"}, "actor_seq_len='6' groups"),
+    ],
+)
+def test_actors_of_fast_td3_that_are_not_known_are_refused(
+    name: str, tensor: tuple[str, tuple[int, ...]] | None, args: dict[str, Any], message: str, tmp_path: Path
+) -> None:
+    saved = states(name)
+    if tensor is not None:
+        saved["actor_state_dict"][tensor[0]] = np.zeros(tensor[1], np.float32)
+    writer, path = Writer(), tmp_path / "model_final.pt"
+    path.write_bytes(writer.zip({**{k: writer.state(s) for k, s in saved.items()}, "args": args}))
+    with pytest.raises(SourceError, match=message):
+        read_source(path)
+
+
+def test_an_activation_says_nothing_about_fast_td3(tmp_path: Path) -> None:
+    path = checkpoint(tmp_path, "fast_td3_plain")
+    with pytest.raises(UsageError, match="says nothing about FastTD3"):
+        read_source(path, ReadOptions(activation="elu"))

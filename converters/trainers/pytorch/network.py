@@ -77,6 +77,19 @@ class Network(Builder):
         centred = self.add("Sub", [x, self.const(mean, "mean")])
         return clip(self, self.add("RealDiv", [centred, self.add("Sqrt", [spread])]), -5, 5)
 
+    def empirical(self, x: str, module: str) -> str:
+        """``EmpiricalNormalization`` of rsl_rl and FastTD3: (x − mean) / (deviation + 0.01); x where there is none."""
+        if f"{module}._mean" not in self.state:
+            return x
+        mean, deviation = (
+            self.state.array(name, *(1,) * (len(self.state.shape(name)) - 1), self.width(x)).reshape(-1)
+            for name in (f"{module}._mean", f"{module}._std")
+        )
+        self.state.forget(f"{module}._var", f"{module}.count")
+        self.at(module)
+        centred = self.add("Sub", [x, self.const(mean, "mean")])
+        return self.add("RealDiv", [centred, self.const((deviation + FLOAT32.type(1e-2)).astype(FLOAT32), "deviation")])
+
     def lstm(self, x: str, memory: str, module: str) -> tuple[str, str]:
         """One step of ``nn.LSTM``. ``memory`` is [B, 1, 2H], h before c. Returns the output [B, H] and the memory."""
         hidden, *kind = rnn_sizes(self.state, module)
