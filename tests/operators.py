@@ -9,12 +9,10 @@ from __future__ import annotations
 import importlib
 import json
 import pkgutil
-import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from dataclasses import replace as again
-from pathlib import Path
 
 import numpy as np
 import onnx
@@ -23,7 +21,6 @@ from converters.compiler.passes.fold import fold
 from converters.compiler.passes.normalise import normalise
 from converters.compiler.targets import PROGRAM, prepare
 from converters.files import tensorflow_messages as schema
-from converters.files.children.process import RunFailedError
 from converters.formats.format import WriteOptions
 from converters.formats.litert.flatbuffer import decode
 from converters.formats.litert.schema import OPERATOR_NAMES
@@ -38,7 +35,6 @@ from converters.graph.ops.table import TABLE
 from converters.graph.run import run_graph
 from converters.graph.types import FLOAT32
 from converters.policy.policy import Policy
-from converters.runtimes.pool import RuntimePool
 from signatures.code import CodeOptions
 from signatures.errors import UnsupportedOpError
 from tests.barracuda.nn_running import action_model, as_policy
@@ -209,7 +205,7 @@ def _program(sample: Sample) -> list[str] | None:
     return ["loop"] * len(program.stages)
 
 
-#: The columns but the last: their titles, and what gives the operators that a sample became there.
+#: The columns: their titles, and what gives the operators that a sample became there.
 WRITERS: Mapping[str, Callable[[Sample], Sequence[str] | None]] = {
     "TensorFlow": _tensorflow,
     "TensorFlow.js": _tfjs,
@@ -218,7 +214,6 @@ WRITERS: Mapping[str, Callable[[Sample], Sequence[str] | None]] = {
     "LiteRT": _litert,
     "code": _program,
 }
-KERNEL = "kernel"
 
 
 def outcomes(op: str, title: str) -> Iterator[Outcome]:
@@ -232,24 +227,6 @@ def outcomes(op: str, title: str) -> Iterator[Outcome]:
         else:
             if operators is not None:
                 yield Outcome(operators, sample.outputs, counts=alone)
-
-
-def kernel_outcomes(op: str, pool: RuntimePool, folder: Path) -> Iterator[Outcome]:
-    """What becomes of an op's samples by our own kernels in JavaScript, which a page runs."""
-    for sample, alone in samples_of(op):
-        policy = policy_of(sample.graph, sample.fetches)
-        try:
-            artifact = WRITTEN["tfjs"].artifact(policy, _OPTIONS)
-            artifact.write(folder)
-            model = pool.process("js").load(str(folder / artifact.main))
-            model.predict(dict(sample.feeds), [s.name for s in policy.signature.outputs])
-            model.unload()
-        except UnsupportedOpError as error:
-            yield Outcome(refused=tuple(error.issues))
-        except RunFailedError as error:  # "no kernel for the op …"
-            yield Outcome(refused=(("op", op),) if f" {op}" in str(error) else ())
-        else:
-            yield Outcome(_tfjs(sample), sample.outputs, counts=alone)
 
 
 def cell(found: Iterable[Outcome]) -> str:
@@ -285,8 +262,8 @@ What each operation becomes, found by writing its samples, which the tests compa
 {REFUSED} refused, by name. `{SOME_SEVERAL}`: some forms take several. `{SOME_REFUSED}`: some are refused.
 
 *TensorFlow*: `.bytes`; the SavedModel differs in forms of {", ".join(f"`{op}`" for op in IN_SAVED_MODEL)}, \
-for `tensorflowjs_converter`. *Code*: C, C# and JavaScript, in nests of loops. *Kernel*: our own, of the TensorFlow.js \
-model. *Rounds*: {_PRECISIONS["exact"]} never, {_PRECISIONS["rounded"]} once, \
+for `tensorflowjs_converter`. *Code*: C, C# and JavaScript, in nests of loops. \
+*Rounds*: {_PRECISIONS["exact"]} never, {_PRECISIONS["rounded"]} once, \
 {_PRECISIONS["summed"]} sums in any order, {_PRECISIONS["approximate"]} approximated (below).
 `_Fused…` are made of layers, for targets that have them.
 """
@@ -300,7 +277,7 @@ How far results are off at most: units in the last place/absolute, whichever is 
 
 
 def writer_cells(op: str) -> list[str]:
-    """An op's cells but the last."""
+    """What each target makes of an op."""
     return [cell(outcomes(op, title)) for title in WRITERS]
 
 
@@ -309,26 +286,24 @@ def line(cells: Iterable[str]) -> str:
     return f"| {' | '.join(cells)} |"
 
 
-def row_begins(op: str) -> str:
-    """An op's line up to the cell that needs Node."""
+def row(op: str) -> str:
+    """An op's line."""
     entry = TABLE[op]
     return line([f"`{op}`", _PRECISIONS["exact" if entry.exact else entry.precision], *writer_cells(op)])
 
 
-def page(pool: RuntimePool) -> str:
+def page() -> str:
     """Return the page in Markdown."""
-    with tempfile.TemporaryDirectory() as folder:
-        return "\n".join((HEAD, *_matrix(pool, Path(folder)), "", BOUNDS, *_bounds())) + "\n"
+    return "\n".join((HEAD, *_matrix(), "", BOUNDS, *_bounds())) + "\n"
 
 
-def _matrix(pool: RuntimePool, folder: Path) -> Iterator[str]:
-    titles = ["op", "rounds", *WRITERS, KERNEL]
+def _matrix() -> Iterator[str]:
+    titles = ["op", "rounds", *WRITERS]
     yield line(titles)
     yield f"|{'---|' * len(titles)}"
     for family, found in FAMILIES.items():
         yield line([f"**{family}**", *[""] * (len(titles) - 1)])
-        for op in found:
-            yield f"{row_begins(op)} {cell(kernel_outcomes(op, pool, folder))} |"
+        yield from map(row, found)
     yield ""
     yield f"Written as these first: {', '.join(f'`{op}`' for op in OLDER)}."
 
@@ -349,5 +324,4 @@ def _bound(bound: tuple[float, float]) -> str:
 
 
 if __name__ == "__main__":
-    with RuntimePool() as processes:
-        PAGE.write_text(page(processes), encoding="utf-8")
+    PAGE.write_text(page(), encoding="utf-8")

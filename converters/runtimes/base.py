@@ -48,7 +48,7 @@ class Runtime(Struct, frozen=True):
     install: Callable[[Progress], object] | None = None
     #: It reads the files of sources by itself.
     originals: bool = False
-    #: It computes by itself; numpy and js are this project's own.
+    #: It computes by itself; numpy is this project's own.
     independent: bool = True
     #: How it approximates functions (converters/graph/ops/approximations.py).
     arithmetic: Arithmetic = "processor"

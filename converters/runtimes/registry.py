@@ -20,7 +20,6 @@ ROOMS = (
     "tensorflow1",
     "onnxruntime",
     "javascript",
-    "js",
     "litert",
     "c",
     "csharp",

@@ -2,7 +2,8 @@
 
 A browser loads no modules from ``file:``, so they are put into one script, each as a function of its own. The policy's
 files are data in a ``<script type="application/json">``, in which no ``<`` is left: nothing that a bundle says can end
-that element. The security policy names the script and the style by their hashes, and allows no connection.
+that element. The security policy names the script and the style by their hashes, allows the modules that a visitor
+drops (``blob:``), and no connection.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ def one_file(site: Mapping[str, bytes]) -> bytes:
     held = _as_json(files).replace("<", "\\u003c")
     icon = f"data:image/svg+xml;base64,{base64.b64encode(site['icon.svg']).decode()}"
     policy = (
-        f"default-src 'none'; script-src '{_hash(script)}'; style-src '{_hash(style)}'; img-src data: blob:; "
+        f"default-src 'none'; script-src '{_hash(script)}' blob:; style-src '{_hash(style)}'; img-src data: blob:; "
         "base-uri 'none'; form-action 'none'"
     )
     page = site[INDEX].decode()

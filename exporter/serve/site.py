@@ -12,20 +12,18 @@ from typing import Any
 from msgspec import Struct
 
 import converters.formats.tfjs
-from converters.files.fetch import Fetched
 from converters.formats.bundle.bundle import Bundle, dumps, writing
 from converters.formats.bundle.embed import runnable
 from converters.formats.bundle.exchange import exchange, stage
 from converters.formats.registry import FROZEN_GRAPH, ONNX, TFJS, WRITTEN
-from converters.formats.tfjs.reader import content_of
 from converters.runtimes.javascript.node import INSTALL_TFJS, check_packages, js_home, package_version
-from converters.runtimes.js import KERNELS
 from exporter import __version__
+from exporter.serve.engine import engine_of, makers_module
 from exporter.serve.scenes import AUTO, Scene, other_side, scene_of
 from exporter.serve.selftest import golden
 from exporter.serve.server import DATA, INDEX, TYPES
 from signatures.contract import PARITY, POLICY, json_of
-from signatures.errors import BundleError, RuntimeUnavailableError, naming
+from signatures.errors import BundleError, RuntimeUnavailableError, UnsupportedOpError, naming
 
 PAGE = Path(__file__).resolve().parent / "page"
 #: Stills of the environments, of ``make pictures``.
@@ -54,7 +52,7 @@ _ORT = "onnxruntime-web"
 
 
 class _Backend(Struct, frozen=True):
-    """What runs a policy besides the page's own kernels: ``files`` of a ``package``, the first one its script."""
+    """What runs a policy besides the module of ``--to js``: ``files`` of a ``package``, the first one its script."""
 
     name: str
     package: str
@@ -84,20 +82,27 @@ _BACKENDS = (
         large=True,
     ),
 )
-_JS = {"name": "js", "script": None}
-"""The kernels that are part of the page."""
+_JS: Mapping[str, Any] = {"name": "js", "script": None}
+"""The policy's own module, which is part of the page."""
 
 
 def assemble(folder: Path, scene: str = AUTO) -> dict[str, bytes]:
     """The site of a bundle, by path; the same bytes for the same bundle.
 
-    Without the npm packages the page runs on its own kernels alone, and says so. Raises BundleError (its files are not
-    those of policy.json, it holds no TensorFlow.js or no .bytes), UsageError (the scene does not fit).
+    Without the npm packages the page runs on the policy's module alone, and says so. Raises BundleError (its files are
+    not those of policy.json, it holds no TensorFlow.js or no .bytes, nothing here runs it), UsageError (the scene does
+    not fit).
     """
-    site, said = _content(folder, scene)
+    site, said, refused = _content(folder, scene, whole=True)
     vendor, backends, absent = _vendor(ONNX.key in said["models"]["model"])
     site.update(vendor)
-    site[SITE] = dumps({**said, "backends": [_JS, *backends], "absent": absent})
+    if refused is None:
+        backends.insert(0, _JS)
+    elif backends:
+        absent.insert(0, {"name": "js", "why": str(refused)})
+    else:
+        raise _no_engine(folder, refused, INSTALL_TFJS)
+    site[SITE] = dumps({**said, "backends": backends, "absent": absent})
     site[INDEX] = _asking_at_once(site)
     picture = preview(said["scene"])
     if picture is not None:
@@ -118,18 +123,16 @@ def _with_picture(page: bytes, address: str) -> bytes:
 
 
 def assemble_one_file(folder: Path, scene: str = AUTO, *, picture: str | None = None) -> bytes:
-    """The page as one HTML file, which needs no server and no network, on its own kernels.
+    """The page as one HTML file, which needs no server and no network, on the policy's module.
 
     ``picture`` lies beside it, for messengers that show one with a link. Raises as ``assemble``, and DamagedFileError.
     """
     from exporter.serve.onefile import one_file
 
-    site, said = _content(folder, scene)
-    with naming(folder):  # it stands in the page as JSON, so it has to be some
-        content_of(Fetched(Bundle.open(folder).path(TFJS)))
-    for place in said["models"].values():
-        site.pop(place.pop(ONNX.key, ""), None)
-    absent = [{"name": "TensorFlow.js", "why": "a page of one file runs on its own kernels alone"}]
+    site, said, refused = _content(folder, scene, whole=False)
+    if refused is not None:
+        raise _no_engine(folder, refused, "write a folder, which runs TensorFlow.js: -o NAME")
+    absent = [{"name": "TensorFlow.js", "why": "a page of one file runs on the policy's own module alone"}]
     site[SITE] = dumps({**said, "tfjs": None, "backends": [_JS], "absent": absent})
     if picture is not None:
         site[INDEX] = _with_picture(site[INDEX], picture)
@@ -137,8 +140,17 @@ def assemble_one_file(folder: Path, scene: str = AUTO, *, picture: str | None = 
         return one_file(site)
 
 
-def _content(folder: Path, scene: str) -> tuple[dict[str, bytes], dict[str, Any]]:
-    """(all files but those of npm packages and site.json, what site.json says of the policy)."""
+def _no_engine(folder: Path, refused: UnsupportedOpError, fix: str) -> BundleError:
+    return BundleError("cannot be shown", where=str(folder), why=f"no page runs it: {refused}", fix=fix)
+
+
+def _content(
+    folder: Path, scene: str, *, whole: bool
+) -> tuple[dict[str, bytes], dict[str, Any], UnsupportedOpError | None]:
+    """(files without npm packages and site.json, what site.json says of the policy, why the policy has no module).
+
+    ``whole``: with what other engines than the module run.
+    """
     policy = _open_checked(folder)
     found = scene_of(policy.name, policy.signature, scene)
     opponent = None if found is None or found.side is None else _opponent(policy, found)
@@ -147,35 +159,53 @@ def _content(folder: Path, scene: str) -> tuple[dict[str, bytes], dict[str, Any]
     if found is not None:
         site[_VIEWS] = f'import {{ viewOf as own }} from "./{found.id}.mjs";\nexport const viewOf = own;\n'.encode()
     site["policy.mjs"] = POLICY_MODULE.read_bytes()
-    site.update({f"kernels/{path.name}": path.read_bytes() for path in sorted(KERNELS.glob("*.mjs"))})
-    site.update(_model(policy, "model"))
-    size = sum(len(v) for k, v in site.items() if k.startswith("model/"))
-    models: dict[str, dict[str, str]] = {"model": {"folder": "model/"}}
-    if policy.has(ONNX):
+    site[POLICY] = dumps(policy.content)
+    model = _model(policy, "model")
+    site.update(model if whole else {})
+    models: dict[str, dict[str, str]] = {
+        "model": {"folder": "model/", "contract": POLICY, "weights": "model/weights.bin"}
+    }
+    if policy.has(ONNX) and whole:
         models["model"][ONNX.key] = "model/policy.bin"
         site["model/policy.bin"] = policy.path(ONNX).read_bytes()
-    if opponent is not None:
-        site.update(_model(opponent, "opponent"))
-        models["opponent"] = {"folder": "opponent/"}
     with naming(policy.graph_file):
         graph = runnable(policy.graph())
         policy.check_graph(graph)
         said, data = golden(policy.signature, graph)
     site["golden.json"], site["golden.bin"] = f"{json.dumps(said, separators=(',', ':'))}\n".encode(), data
-    site["policy.json"] = dumps(policy.content)
+    players = {"model": (policy, graph)}
+    if opponent is not None:
+        site.update(_model(opponent, "opponent") if whole else {})
+        contract = f"opponent/{POLICY}"
+        site[contract] = dumps(opponent.content)
+        models["opponent"] = {"folder": "opponent/", "contract": contract, "weights": "opponent/weights.bin"}
+        players["opponent"] = opponent, runnable(opponent.graph())
+    refused, makers = None, dict[str, str]()
+    try:
+        for name, player in players.items():
+            engine = engine_of(*player)
+            makers[name] = f"{name}/engine.mjs"
+            site.update({makers[name]: engine.module, models[name]["weights"]: engine.weights})
+    except UnsupportedOpError as error:
+        refused, makers = error, {}
+    site["makers.mjs"] = makers_module(makers)
     site[INDEX] = describe_page(site[INDEX], policy.name, policy.signature.family, found is not None)
-    return site, {
-        "made_by": MADE_BY,
-        "version": __version__,
-        "name": policy.name,
-        "scene": None if found is None else found.id,
-        "side": None if found is None else found.side,
-        "opponent": None if opponent is None else opponent.name,
-        "tfjs": package_version(js_home(), _TFJS),
-        "models": models,
-        "model_bytes": size,
-        "original": _original(policy),
-    }
+    return (
+        site,
+        {
+            "made_by": MADE_BY,
+            "version": __version__,
+            "name": policy.name,
+            "scene": None if found is None else found.id,
+            "side": None if found is None else found.side,
+            "opponent": None if opponent is None else opponent.name,
+            "tfjs": package_version(js_home(), _TFJS),
+            "models": models,
+            "model_bytes": sum(map(len, model.values())),
+            "original": _original(policy),
+        },
+        refused,
+    )
 
 
 def _original(policy: Bundle) -> dict[str, str] | None:

@@ -34,7 +34,7 @@ pytestmark = [pytest.mark.corpus, pytest.mark.slow]
 Arrays = Mapping[str, np.ndarray]
 QUICK = ("numpy", "onnxruntime")
 CASES = [
-    pytest.param(f, c, QUICK if number % 6 and FULL not in os.environ else ("numpy", "js", *NEEDED), id=f.name)
+    pytest.param(f, c, QUICK if number % 6 and FULL not in os.environ else ("numpy", *NEEDED), id=f.name)
     for number, (f, c) in enumerate(genuine_cases())
 ] or [pytest.param(Path("absent"), {}, QUICK, id="shared-is-absent")]
 

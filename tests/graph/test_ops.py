@@ -139,19 +139,6 @@ def test_source_code(op: str, key: str, runtimes: Runtimes) -> None:
     assert found == []
 
 
-@each_op
-def test_own_javascript(op: str, runtimes: Runtimes) -> None:
-    """The kernels of a page are those of numpy, to the last digit but one."""
-    assert problems(
-        op,
-        "js",
-        lambda sample: runtimes.tfjs("js", policy_of(sample.graph, sample.fetches), sample.feeds),
-        narrowed=True,
-        atol=0,
-        rtol=1.2e-7,
-    ) == []  # fmt: skip
-
-
 def problems(op: str, runtime: str, run: Callable[[Sample], list[Array]], **how: float) -> list[str]:
     """Where a runtime does not do what the samples of an op say."""
     found = []
@@ -285,7 +272,7 @@ def nothing_known(sample: Sample) -> None:
 # ------------------------------------------------------------------ slices
 
 
-@pytest.mark.parametrize("runtime", ["tensorflow", "onnxruntime", *TFJS, "js"])
+@pytest.mark.parametrize("runtime", ["tensorflow", "onnxruntime", *TFJS])
 def test_random_slices(runtime: str, runtimes: Runtimes) -> None:
     """All masks of StridedSlice at once, many slices in one graph."""
     graph, feeds, fetches = random_slices(400, seed=5)

@@ -39,8 +39,6 @@ DEMO = {
 }
 #: What the packages of a base install may take together, in 10^6 bytes.
 LARGEST = 155
-#: Needs Node alone, which is beside the environment or not.
-NODES = ["js"] if shutil.which("node") else []
 COMPILERS = [
     *(["c"] if any(map(shutil.which, ("gcc", "clang"))) else []),
     *(["csharp"] if all(map(shutil.which, ("mcs", "mono"))) else []),
@@ -208,7 +206,7 @@ def test_the_runtimes_are_listed_with_what_installs_them(installed: Installed) -
     done = installed.run("export-model", "runtimes", "--json")
     assert done.returncode == 0, done.stderr
     found = {r["name"]: r for r in json.loads(done.stdout)["runtimes"]}
-    assert [name for name, r in found.items() if r["installed"]] == ["numpy", *NODES, *COMPILERS]
+    assert [name for name, r in found.items() if r["installed"]] == ["numpy", *COMPILERS]
     assert "export-model[tensorflow]" in found["tensorflow"]["install"]
     assert "export-model[onnxruntime]" in found["onnxruntime"]["install"]
     assert "export-model runtimes install tfjs" in found["tfjs-cpu"]["install"]

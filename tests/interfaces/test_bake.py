@@ -159,13 +159,13 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("runtimes", ["onnxruntime", "js"])
+@pytest.mark.parametrize("runtimes", ["onnxruntime", "node"])
 @pytest.mark.parametrize("fault", WRONG)
 def test_a_wrong_bake_is_found(fault: str, runtimes: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All files have it alike: by the source's own action, or by our kernels', with what is stated applied apart."""
     made = bake._whole
     monkeypatch.setattr(bake, "_whole", lambda terms, width: WRONG[fault](made(terms, width)))
-    ran = baked(tmp_path, "--to", "bytes,onnx,tfjs", "--verify", runtimes)
+    ran = baked(tmp_path, "--to", "bytes,onnx,js", "--verify", runtimes)
     assert ran.status == 1
     assert "action differs by" in ran.out
 

@@ -208,10 +208,9 @@ def test_a_hand_a_comparison_and_a_drop(bundle: Bundle, tmp_path: Path) -> None:
     """A ball is dragged, an untrained network loses what the trained one keeps, a dropped bundle acts or is refused."""
     page = tmp_path / "page.html"
     page.write_bytes(assemble_one_file(bundle("3DBall")))
-    model = bundle("3DBall") / "tfjs"
-    whole = [
-        [p.name, base64.b64encode(p.read_bytes()).decode()] for p in model.iterdir() if p.suffix in (".json", ".bin")
-    ]
+    assert export_model(run_folder("3DBall"), "-o", tmp_path, "--to", "js", "--verify", "none").status == 0
+    kept = ("3DBall.mjs", "policy.json")
+    whole = [[name, base64.b64encode((tmp_path / "3DBall" / name).read_bytes()).decode()] for name in kept]
     x = "document.querySelector('.bars').rows[2].lastChild.textContent"
     said, titles = (
         "document.querySelector('#said').textContent",
@@ -233,9 +232,11 @@ def test_a_hand_a_comparison_and_a_drop(bundle: Bundle, tmp_path: Path) -> None:
             ["eval", STATUS],
             ["eval", "location.hash"],
             ["drop", [["notes.txt", ""]]],
-            ["wait", f"{said}.includes('neither a tfjs/model.json')"],
-            ["drop", [["model.json", base64.b64encode(b'{"modelTopology": {"node": []}}').decode()]]],
+            ["wait", f"{said}.includes('no policy.json with a module beside it')"],
+            ["drop", [["policy.json", base64.b64encode(b'{"inputs": 1}').decode()]]],
             ["wait", f"{said}.includes('no contract of export-model')"],
+            ["drop", whole[1:]],
+            ["wait", f"{said}.includes('export it with js among --to')"],
             ["drop", whole],
             ["wait", f"{titles} === '3DBall (dropped here)' && {second}.seconds > 3"],
             ["eval", "document.querySelector('#apart').textContent"],
@@ -246,7 +247,8 @@ def test_a_hand_a_comparison_and_a_drop(bundle: Bundle, tmp_path: Path) -> None:
     assert seen.results[9]["bad"] == "0"
     assert seen.results[10] == "#speed=8", "what it opens with stands in no address"
     assert seen.results[-1] == "Now the answers differ by 0, the states by 0."
-    assert (seen.console, seen.requests) == ([], [page.as_uri()])
+    asked = [address for address in seen.requests if not address.startswith("blob:")]  # the module that was dropped
+    assert (seen.console, asked) == ([], [page.as_uri()])
 
 
 def test_a_crawler_walks_ahead_and_lands_on_its_feet(bundle: Bundle, tmp_path: Path) -> None:
@@ -287,7 +289,9 @@ def test_two_engines_side_by_side_from_one_seed(tmp_path: Path) -> None:
     words = "document.querySelector('#apart')?.textContent ?? ''"
     onnx = tmp_path / "3DBall" / "3DBall.onnx"
     played = "document.querySelector('#status-2')?.dataset.seconds > 2"
-    site = with_backends(assemble(tmp_path / "3DBall"), "js", "wasm", "onnxruntime-web")
+    site = with_backends(assemble(tmp_path / "3DBall"), "js", "cpu", "wasm", "onnxruntime-web")
+    said, model = "document.querySelector('#said').textContent", tmp_path / "3DBall" / "tfjs"
+    data = [[p.name, base64.b64encode(p.read_bytes()).decode()] for p in model.iterdir() if p.suffix != ".mts"]
     with served(site) as server:
         seen = visit(
             f"{server.url}#beside=wasm",
@@ -305,9 +309,18 @@ def test_two_engines_side_by_side_from_one_seed(tmp_path: Path) -> None:
                 ["wait", "document.querySelectorAll('.lane .title')[1].textContent === '3DBall (dropped here)'"],
                 ["wait", played],
                 ["eval", words],
+                ["drop", [["notes.txt", ""]]],
+                ["wait", f"{said}.includes('neither a tfjs/model.json')"],
+                ["drop", [["model.json", base64.b64encode(b'{"modelTopology": {"node": []}}').decode()]]],
+                ["wait", f"{said}.includes('no contract of export-model')"],
+                ["select", "#beside", ""],
+                ["drop", data],
+                ["wait", "document.querySelectorAll('.lane .title')[1].textContent === '3DBall (dropped here)'"],
+                ["wait", played],
+                ["eval", words],
             ],
         )
-    for said in (seen.results[1], seen.results[5], seen.results[-1]):
+    for said in (seen.results[1], seen.results[5], seen.results[9], seen.results[-1]):
         answers, states = (float(n) for n in re.findall(r"by (\S+?)[,.](?:\s|$)", said))
         assert 0 <= answers < 1e-3, said
         assert 0 <= states < 1e-3, said

@@ -33,7 +33,6 @@ FORMATS = {
     "litert-plain": LITERT,
     "tfjs-cpu": TFJS,
     "tfjs-wasm": TFJS,
-    "js": TFJS,
     "tensorflow-bytes": FROZEN_GRAPH,
 }
 

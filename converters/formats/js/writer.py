@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
 
 from converters.files.chunks import Pieces
 from converters.formats.format import WriteOptions
 from converters.formats.js.text import JS_ARRAYS, JavaScript
 from converters.formats.programs.members import Field
-from converters.formats.programs.plan import CLOSE, NAN_SAID, ROWS, Plan, formula, write_program
+from converters.formats.programs.plan import CLOSE, NAN_SAID, ROWS, Plan, formula, plan_of, write_program
 from converters.formats.programs.weights import weights_name
 from converters.graph.ops.loops.layers import box_muller, gumbel
 from converters.graph.printer import Printer
@@ -62,7 +63,30 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
     return write_program(policy, options, ".mjs", _text)
 
 
+class Module(Struct, frozen=True):
+    """A module: its text, its class, the content of its file of weights, the shape of each float32 constant by name."""
+
+    text: str
+    class_name: str
+    file: bytes
+    weights: Mapping[str, tuple[int, ...]]
+
+
+def write_module(policy: Policy, options: WriteOptions) -> Module:
+    """Write the module of a policy for who looks into it. Raises UnsupportedOpError."""
+    plan = plan_of(policy, options)
+    text, printer = _module(policy.name, plan)
+    places = [kept.place for kept in plan.weights.kept if kept.place.dtype == np.float32]
+    shapes = {printer.name(p): p.value.shape for p in places if p.value is not None}
+    return Module(text, plan.header.class_name, plan.weights.file or b"", shapes)
+
+
 def _text(name: str, plan: Plan) -> str:
+    return _module(name, plan)[0]
+
+
+def _module(name: str, plan: Plan) -> tuple[str, Printer]:
+    """The module, and what printed it: it knows the names of constants."""
     header, program = plan.header, plan.program
     taken = ("fround", header.class_name, *sorted({f.name for f in (*header.fed, *header.answered)}))
     words = JavaScript(plan.code.math == "own")
@@ -110,7 +134,7 @@ def _text(name: str, plan: Plan) -> str:
         f"export const ports = {json.dumps(_ports(plan))};",
         f"export default {header.class_name};",
     ]
-    return "\n\n".join(parts) + "\n"
+    return "\n\n".join(parts) + "\n", printer
 
 
 def _compute_lines(plan: Plan, printer: Printer) -> list[str]:

@@ -33,11 +33,7 @@ FORMATS = (
         ports=_artifact.ports,
         vetted=_artifact.safe_copy,
         inner=_artifact.inner,
-        runtimes=(
-            *("tfjs-cpu", "tfjs-wasm", "tfjs-webgl"),
-            *("tfjs-cpu@chromium", "tfjs-wasm@chromium"),
-            "js",
-        ),
+        runtimes=("tfjs-cpu", "tfjs-wasm", "tfjs-webgl", "tfjs-cpu@chromium", "tfjs-wasm@chromium"),
         predicts=True,
         dtypes=frozenset({"float32", "int32", "bool"}),
     ),

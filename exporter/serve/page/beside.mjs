@@ -1,7 +1,7 @@
 /** Policies to put beside the page's own: the same one untrained, and what a visitor drops on the page. */
 
-import { withKernels, withOnnx } from "./engines.mjs";
-import { artifacts } from "./files.mjs";
+import { withModule, withOnnx, withTfjs } from "./engines.mjs";
+import { artifacts, isOneFile } from "./files.mjs";
 import { Policy } from "./policy.mjs";
 import { Streams } from "./scenes/base.mjs";
 
@@ -10,30 +10,20 @@ const MOST_BYTES = 200e6;
 const EMBEDDED = "export_model_contract";
 
 /** The same network with its matrices drawn anew, as before training; what the normaliser knows stays. */
-export async function untrained(source, seed = 1) {
+export async function untrained({ contract, ...source }, seed = 1) {
   const random = new Streams(seed, 1);
-  const weightData = source.weightData.slice();
-  let offset = 0;
-  for (const { shape, dtype } of source.weightSpecs) {
-    const count = shape.reduce((product, n) => product * n, 1);
-    if (dtype === "float32" && shape.length > 1 && Math.min(...shape.slice(-2)) > 1) {
-      const bound = Math.sqrt((6 * shape.at(-1)) / (count + shape.at(-1) ** 2));
-      const values = Float32Array.from({ length: count }, () => random.uniform(0, -bound, bound));
-      new Uint8Array(weightData, offset, 4 * count).set(new Uint8Array(values.buffer));
+  const { run } = await withModule(source, (matrices) => {
+    for (const [values, columns] of matrices()) {
+      const bound = Math.sqrt((6 * columns) / (values.length + columns ** 2));
+      values.forEach((_, i) => (values[i] = random.uniform(0, -bound, bound)));
     }
-    offset += count * (dtype === "bool" ? 1 : 4);
-  }
-  return policy({ ...source, weightData });
-}
-
-async function policy(source, contract = source.userDefinedMetadata?.contract, engine = withKernels) {
-  const held = checked(typeof contract === "string" ? JSON.parse(contract) : contract);
-  const { run } = await engine({ artifacts: source, onnx: async () => source });
-  return new Policy(held, run, () => {}, 0);
+  });
+  return new Policy(contract, run, () => {}, 0);
 }
 
 /** A contract as far as this page reads it; what it says is shown as text only. */
-function checked(contract) {
+function checked(held) {
+  const contract = typeof held === "string" ? JSON.parse(held) : held;
   const tensors = (list) => Array.isArray(list) && list.every(({ name, role, shape }) => {
     return typeof name === "string" && typeof role === "string" && Array.isArray(shape) && shape.every((n) => n === null || Number.isSafeInteger(n));
   });
@@ -54,7 +44,18 @@ export function fitting(own, other) {
 
 // ---- what is dropped ------------------------------------------------------------------------------------------------
 
-/** The policy in a drop: a bundle's folder, the files of its tfjs folder, or an `.onnx`. `onnxruntime`: its module's address. */
+/** What may be dropped on this page, said before somebody tries. `engines`: the names of its engines. */
+export function droppable(engines) {
+  if (isOneFile) return "Drop the folder of a bundle here to compare it. It takes one exported with js among --to: this page runs nothing but modules.";
+  if (engines.has("onnxruntime-web")) return "Drop the folder of a bundle here to compare it, or an .onnx that export-model wrote.";
+  if (engines.has("cpu")) return "Drop the folder of a bundle here to compare it. This page runs no .onnx: that takes onnxruntime-web.";
+  return "Nothing can be dropped here: that takes TensorFlow.js, or a page of one file.";
+}
+
+/**
+ * The policy in a drop: a bundle's folder, the files of its tfjs folder, or an `.onnx`. `onnxruntime`: its module's
+ * address. A page of one file, which may connect to nothing, runs the bundle's own module; any other runs its data alone.
+ */
 export async function dropped(items, onnxruntime) {
   const files = new Map();
   const given = Array.from(items, (item) => [item.webkitGetAsEntry?.(), item.getAsFile()]); // gone after the first await
@@ -65,21 +66,37 @@ export async function dropped(items, onnxruntime) {
   const size = Array.from(files.values()).reduce((sum, file) => sum + file.size, 0);
   if (size > MOST_BYTES) throw new Error("it is larger than 200 MB");
   const find = (end) => Array.from(files.keys()).find((name) => name.endsWith(end));
+  const file = (name) => {
+    if (!files.has(name)) throw new Error(`${name} is missing`);
+    return files.get(name);
+  };
+  const read = { json: async (name) => JSON.parse(await file(name).text()), bytes: (name) => file(name).arrayBuffer() };
+  if (isOneFile) return ofModule(find("/policy.json"), read, (name) => files.has(name));
   const model = find("model.json");
   if (model !== undefined) {
-    const folder = model.slice(0, -"model.json".length);
-    const file = (name) => {
-      if (!files.has(name)) throw new Error(`${name} is missing`);
-      return files.get(name);
-    };
-    const read = { json: async (name) => JSON.parse(await file(name).text()), bytes: (name) => file(name).arrayBuffer() };
-    return policy(await artifacts(folder, read));
+    const source = await artifacts(model.slice(0, -"model.json".length), read);
+    const contract = checked(source.userDefinedMetadata?.contract);
+    const { run } = await withTfjs("cpu", null)({ artifacts: async () => source });
+    return new Policy(contract, run, () => {}, 0);
   }
   const onnx = find(".onnx");
   if (onnx === undefined) throw new Error("it has neither a tfjs/model.json nor an .onnx");
   if (onnxruntime === undefined) throw new Error("an .onnx needs onnxruntime-web, which is not in this page: drop the bundle's folder");
-  const bytes = await files.get(onnx).arrayBuffer();
-  return policy(bytes, metadata(new Uint8Array(bytes), EMBEDDED), withOnnx(onnxruntime));
+  const bytes = await read.bytes(onnx);
+  const contract = checked(metadata(new Uint8Array(bytes), EMBEDDED));
+  const { run } = await withOnnx(onnxruntime)({ onnx: async () => bytes });
+  return new Policy(contract, run, () => {}, 0);
+}
+
+/** The policy of a bundle by its own module, whose file stands beside policy.json. */
+async function ofModule(place, read, has) {
+  const contract = place === undefined ? undefined : checked(await read.json(place));
+  const module = `${place?.slice(0, -"policy.json".length)}${contract?.name}.mjs`;
+  if (!has(module)) throw new Error("it has no policy.json with a module beside it: export it with js among --to, and drop its folder");
+  const address = URL.createObjectURL(new Blob([await read.bytes(module)], { type: "text/javascript" }));
+  const { default: Agent, ports, load } = await import(address);
+  const { run } = await withModule({ make: () => ({ Agent, ports, load }), weights: () => read.bytes(module.replace(/\.mjs$/, ".weights.bin")) });
+  return new Policy(contract, run, () => {}, 0);
 }
 
 async function gather(entry, files, depth = 0) {

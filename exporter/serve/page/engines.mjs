@@ -1,8 +1,9 @@
 /**
- * What runs a model in a page: this project's own kernels, TensorFlow.js on one of its backends, onnxruntime-web.
+ * What runs a model in a page: the policy's own module, TensorFlow.js on one of its backends, onnxruntime-web.
  *
- * An engine is a function of a source, `{ artifacts, onnx }` (a graph model; a function that gives the bytes of an ONNX
- * model), to a loaded model:
+ * An engine is a function of a source to a loaded model. A source has functions: `make` (the module, as engine.py wraps
+ * it), `weights` (the module's), `artifacts` (a graph model), `onnx` (the bytes of an ONNX model); those that are not
+ * there are undefined.
  *
  *     run(feeds, names)   → by name { data, shape }; `feeds` are { data, shape, dtype } by name
  *     device()            → what computes, in words
@@ -10,18 +11,20 @@
  */
 
 import { script } from "./files.mjs";
-import { GraphModel } from "./kernels/model.mjs";
+import { withCode } from "./policy.mjs";
 
 const narrow = (dtype) => (dtype === "int64" ? "int32" : dtype);
+/** A stream of draws for each model that draws by itself. */
+const anySeed = () => Math.floor(Math.random() * 2 ** 48);
 
-// ---- the kernels of this page ---------------------------------------------------------------------------------------
+// ---- the policy's own module ----------------------------------------------------------------------------------------
 
-export async function withKernels({ artifacts }) {
-  const model = new GraphModel(artifacts);
-  const run = async (feeds, names) => {
-    const given = Object.entries(feeds).map(([name, { data, shape, dtype }]) => [name, { data, shape, dtype: narrow(dtype) }]);
-    return model.run(Object.fromEntries(given), names);
-  };
+/** What runs a module that `--to js` wrote; `redraw` changes its weights before. */
+export async function withModule({ make, weights }, redraw = () => {}) {
+  const { Agent, ports, load, matrices } = make();
+  load?.(await weights());
+  redraw(matrices);
+  const run = withCode({ default: Agent, ports }, new Agent(anySeed()));
   return { run, device: () => "processor, without WebAssembly", dispose() {} };
 }
 
@@ -62,7 +65,7 @@ export const withTfjs = (backend, src) => ({ artifacts }) => exclusive(async () 
     if (backend === "wasm") tf.wasm.setWasmPaths(new URL("vendor/", document.baseURI).href);
   }
   await switched(tf, backend);
-  const model = await tf.loadGraphModel({ load: async () => artifacts });
+  const model = await tf.loadGraphModel({ load: artifacts });
   const run = (feeds, names) => exclusive(async () => {
     await switched(tf, backend);
     const given = Object.fromEntries(

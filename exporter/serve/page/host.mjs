@@ -1,7 +1,8 @@
 /** The policies of this page, on whichever engine is asked for. */
 
-import { withKernels, withOnnx, withTfjs } from "./engines.mjs";
-import { artifacts, bytes } from "./files.mjs";
+import { withModule, withOnnx, withTfjs } from "./engines.mjs";
+import { artifacts, bytes, json } from "./files.mjs";
+import { makers } from "./makers.mjs";
 import { Policy } from "./policy.mjs";
 
 export class Host {
@@ -14,15 +15,21 @@ export class Host {
   /** @param {{name: string, script: string | null}[]} backends "js", "onnxruntime-web", or a backend of TensorFlow.js */
   constructor(backends) {
     this.#engines = Object.fromEntries(backends.map(({ name, script }) => {
-      return [name, name === "js" ? withKernels : name === "onnxruntime-web" ? withOnnx(script) : withTfjs(name, script)];
+      return [name, name === "js" ? withModule : name === "onnxruntime-web" ? withOnnx(script) : withTfjs(name, script)];
     }));
     this.backend = null;
   }
 
-  /** @param {Record<string, {folder: string, onnx: string | null}>} places of models, by the names that `policy` takes */
+  /** @param {Record<string, {folder, contract, weights, onnx?}>} places of files, by the names that `policy` takes */
   async fetch(places) {
-    for (const [name, { folder, onnx }] of Object.entries(places)) {
-      this.#sources[name] = { artifacts: await artifacts(folder), ...(onnx && { onnx: () => bytes(onnx) }) };
+    for (const [name, { folder, contract, weights, onnx }] of Object.entries(places)) {
+      this.#sources[name] = {
+        contract: await json(contract),
+        make: makers[name],
+        weights: () => bytes(weights),
+        artifacts: () => artifacts(folder),
+        ...(onnx && { onnx: () => bytes(onnx) }),
+      };
     }
   }
 
@@ -39,9 +46,8 @@ export class Host {
 
   /** A policy on an engine. */
   async policyOn(backend, name = "model") {
-    const held = this.#sources[name].artifacts.userDefinedMetadata?.contract;
     const { run } = await this.model(backend, name);
-    return new Policy(typeof held === "string" ? JSON.parse(held) : held, run, () => {}, 0);
+    return new Policy(this.#sources[name].contract, run, () => {}, 0);
   }
 
   /** Let all policies of the page run on an engine. */

@@ -10,7 +10,7 @@ import { Stage } from "./stage.mjs";
 import { Verdict } from "./verdict.mjs";
 import { viewOf } from "./views/index.mjs";
 
-/** The page's own kernels play at once; images are too much for them. */
+/** The policy's own module plays at once; WebAssembly is faster on images. */
 function preferred(contract, backends) {
   const images = contract.inputs.some(({ role }) => role === "visual_observation");
   const names = backends.map(({ name }) => name);

@@ -1,6 +1,6 @@
 /** A scene: the environment is simulated, the policy acts in it, and both are drawn; beside it another, from the same seed. */
 
-import { dropped, fitting, untrained } from "./beside.mjs";
+import { droppable, dropped, fitting, untrained } from "./beside.mjs";
 import { Bars, Divergence, percent } from "./charts.mjs";
 import { $, frame, h } from "./dom.mjs";
 import { canRecord, Film } from "./film.mjs";
@@ -120,7 +120,7 @@ export class Stage {
         ),
         said,
         h("p", {}, view.story),
-        h("p", { class: "soft", id: "droppable" }, this.#droppable()),
+        h("p", { class: "soft", id: "droppable" }, droppable(new Set(backends.map(({ name }) => name)))),
         divergence.element,
       ),
       h("div", { class: "numbers side-by-side" }, this.#chooser(), this.#numbers(names)),
@@ -214,13 +214,7 @@ export class Stage {
 
   async #other(what) {
     if (what === "") return null;
-    return what === UNTRAINED ? untrained(this.#host.source().artifacts) : this.#host.policyOn(what);
-  }
-
-  /** What may be dropped, said before somebody tries: an .onnx is run by onnxruntime-web, which one file does not hold. */
-  #droppable() {
-    if (this.#large) return "Drop the folder of a bundle here to compare it, or an .onnx that export-model wrote.";
-    return "Drop the folder of a bundle here to compare it. This page runs no .onnx: that takes onnxruntime-web.";
+    return what === UNTRAINED ? untrained(this.#host.source()) : this.#host.policyOn(what);
   }
 
   #takeDrops() {

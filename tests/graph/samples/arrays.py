@@ -219,7 +219,7 @@ ROWS = np.array([[0, 1], [1, 3], [2, 0]], np.int32)
 
 
 def _places() -> Iterator[Sample]:
-    at_once = dict.fromkeys((*TFJS, "js"), "how many it finds is known only when the model runs")
+    at_once = dict.fromkeys(TFJS, "how many it finds is known only when the model runs")
     yield sample("Where", "booleans", bools(3, 4), differs=at_once)
     yield sample("Where", "numbers, NaN among them", f32(0, -0.0, NAN, 1, INF, 0).reshape(3, 2), differs=at_once)
     yield sample("Where", "int32, rank 3", ints(2, 3, 2, low=-1, high=1), differs=at_once)
