@@ -82,7 +82,7 @@ _BACKENDS = (
         large=True,
     ),
 )
-_JS: Mapping[str, Any] = {"name": "js", "script": None}
+_JS: dict[str, Any] = {"name": "js", "script": None}
 """The policy's own module, which is part of the page."""
 
 
