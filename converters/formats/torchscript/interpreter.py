@@ -219,6 +219,7 @@ class Interpreter:
             given, named = self._arguments(arguments, keywords, frame)
             if isinstance(owner, Module):
                 method = self._code.method(owner.type_name, function.attr)
+                self._machine.expect_states(owner, given)
                 with self._machine.inside(owner.path):
                     return self._call(method, [owner, *given], named, frame.depth + 1)
             called = self.attribute_of(owner, function.attr)

@@ -12,7 +12,7 @@ import numpy as np
 from converters.files import unpickle
 from converters.files.pickled_objects import Instance
 from converters.files.torchscript_archive import ScriptArchive
-from converters.formats.torchscript.values import LengthFoundError, Module, Tensor
+from converters.formats.torchscript.values import LengthFoundError, Module, ShapeFoundError, Tensor
 from converters.graph.builder import Builder
 from converters.graph.nodes import NameScope, Node
 from converters.graph.types import BOOL, FLOAT32, INT32, INT64
@@ -25,6 +25,9 @@ DTYPES: Mapping[int, np.dtype[Any]] = {
     4: INT64,
     11: BOOL,
 }
+#: Layers of ``torch.nn`` that are given a history and states, which have so many axes in a batch.
+_RECURRENT = re.compile(r"__torch__\.torch\.nn\.modules\.rnn\.(___torch_mangle_\d+\.)?(GRU|LSTM|RNN)")
+_LAYER_INPUTS, _STATE_AXES = 2, 3
 MEMORY_IN, MEMORY_OUT = "recurrent_in", "recurrent_out"
 #: Numbers of a program: lengths and factors.
 _MAX_NUMBER = 1 << 62
@@ -45,6 +48,7 @@ class Machine:
         self.narrowed = False
         self._archive = archive
         self._open: dict[str, tuple[int, int]] = {}
+        self._inputs: dict[str, int] = {}
         self._buffers: dict[str, Tensor] = {}
         self._names: dict[str, str] = {}
         self._places: dict[str, tuple[str, int]] = {}
@@ -83,6 +87,7 @@ class Machine:
         for axis, length in enumerate(self.b.shape(reference)):
             if isinstance(length, str):
                 self._open[length] = number, axis
+                self._inputs[reference] = number
         return Tensor(reference)
 
     def state(self, name: str) -> Tensor:
@@ -94,6 +99,23 @@ class Machine:
         if symbol not in self._open:
             raise unknown_length()
         return self._open[symbol]
+
+    def expect_states(self, layer: Module, given: Sequence[Any]) -> None:
+        """Raise ShapeFoundError where an input of unknown shape is a state of ``torch.nn``'s recurrent layer.
+
+        ``given`` is what its ``forward`` takes: a batch of histories, and states [layers, 1, hidden].
+        """
+        if not _RECURRENT.fullmatch(layer.type_name) or len(given) != _LAYER_INPUTS or not isinstance(given[0], Tensor):
+            return
+        states = given[1] if isinstance(given[1], list | tuple) else [given[1]]
+        kernel = self.attribute(layer, "weight_hh_l0")
+        if self.b.rank(given[0].read()) != _STATE_AXES or not isinstance(kernel, Tensor):
+            return
+        layers = sum(name.startswith("weight_hh_l") for name in layer.instance.state)
+        shape = (layers, 1, self.b.length(kernel.read(), 1))
+        for state in (s.read() for s in states if isinstance(s, Tensor)):
+            if self.b.rank(state) != _STATE_AXES and state in self._inputs:
+                raise ShapeFoundError(self._inputs[state], shape)
 
     def is_open(self, length: object) -> bool:
         """Whether a length is that of an input, and not known yet."""

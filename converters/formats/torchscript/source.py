@@ -24,7 +24,7 @@ from converters.formats.source import ReadOptions, SourceModel
 from converters.formats.torchscript.code import Code
 from converters.formats.torchscript.interpreter import Interpreter
 from converters.formats.torchscript.machine import MEMORY_IN, MEMORY_OUT, Machine
-from converters.formats.torchscript.values import LengthFoundError, Module, Tensor
+from converters.formats.torchscript.values import LengthFoundError, Module, ShapeFoundError, Tensor
 from converters.graph.types import FLOAT32
 from converters.policy.facts import DOUBLES_NARROWED, SourceFacts
 from converters.policy.memories import part_of, stem_of
@@ -74,6 +74,9 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
             number, axis = machine.place_of(found.symbol)
             known = tuple(found.length if i == axis else d for i, d in enumerate(inputs[number].shape))
             inputs[number] = replace(inputs[number], shape=known)
+            continue
+        except ShapeFoundError as found:
+            inputs[found.number] = replace(inputs[found.number], shape=found.shape)
             continue
         except UnsupportedOpError as error:
             if archive.traced or options.sensors:

@@ -93,6 +93,14 @@ class OpenLength(Struct, frozen=True):
     symbol: str
 
 
+class ShapeFoundError(Exception):
+    """The shape of a whole input, told by the layer that it is a state of: the program is read again."""
+
+    def __init__(self, number: int, shape: tuple[int, ...]) -> None:
+        super().__init__(number, shape)
+        self.number, self.shape = number, shape
+
+
 class LengthFoundError(Exception):
     """The length of an axis that a scripted module does not say, told by what reads it: the program is read again."""
 

@@ -117,6 +117,8 @@ def _cell(step: _Step) -> Callable[..., Any]:
     def translate(m: Machine, x: Any, hx: Any, *params: Any) -> Any:
         weights = [m.constant_numbers(p, "a weight of a recurrent cell") for p in params if p is not None]
         held = [m.ref(h) for h in (hx if isinstance(hx, list | tuple) else [hx])]
+        for state in held:
+            m.expect(state, -1, weights[1].shape[1])
         made = [Tensor(r) for r in step(m, m.ref(x), held, weights)]
         return tuple(made) if len(made) > 1 else made[0]
 
