@@ -103,7 +103,7 @@ IN_SAVED_MODEL: Mapping[str, tuple[frozenset[str], frozenset[str]]] = {
     "Softsign": (frozenset({"Softsign"}), frozenset({"Abs", "Add", "Const", "RealDiv"})),
     "Cast": (frozenset({"Cast"}), frozenset({"NotEqual", "Const"})),
     "SelectV2": (frozenset({"Cast"}), frozenset({"NotEqual", "Const"})),
-    "Conv2D": (frozenset(), frozenset({"Pad", "Const"})),
+    "Conv2D": (frozenset(), frozenset({"Pad", "StridedSlice", "Const"})),
     "DepthwiseConv2dNative": (frozenset(), frozenset({"Pad", "Const"})),
     "StridedSlice": (frozenset(), frozenset({"Squeeze"})),
     "OneHot": (

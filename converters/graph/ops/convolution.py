@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -42,6 +43,7 @@ from converters.graph.ops.loops import layers as loops
 from converters.graph.ops.loops.layers import window_padding
 from converters.graph.ops.rewriting import GraphBuilder
 from converters.graph.types import INT32, Dim, Symbols, TensorType
+from signatures.errors import UnsupportedOpError
 
 T = type_attr()
 _TO_NCHW, _TO_NHWC = [0, 3, 1, 2], [0, 2, 3, 1]
@@ -131,14 +133,26 @@ def _lower_window(node: Node, builder: OnnxBuilder, onnx_op: str, inputs: list[s
     if onnx_op == "Conv":
         attributes["dilations"] = list(dilations)
     if node.attrs["padding"] == "SAME":
-        if all(isinstance(size, int) for size in image[1:3]):
-            pads = [window_padding(int(image[i + 1]), grown[i], strides[i], "SAME")[1:] for i in range(2)]
+        by_one = [n if s > 1 else 1 for n, s in zip(image[1:3], strides, strict=True)]  # which pads all sizes alike
+        if all(isinstance(size, int) for size in by_one):
+            pads = [window_padding(int(by_one[i]), grown[i], strides[i], "SAME")[1:] for i in range(2)]
             attributes["pads"] = [pads[0][0], pads[1][0], pads[0][1], pads[1][1]]
+        elif max(dilations) > 1:  # auto_pad takes no dilations in onnxruntime
+            raise _unknown_size_error(node)
         else:
             attributes["auto_pad"] = "SAME_UPPER"
     value = builder.emit("Transpose", [builder.value(node.inputs[0])], perm=_TO_NCHW)
     value = builder.emit(onnx_op, [value, *inputs], **attributes)
     return builder.emit("Transpose", [value], perm=_TO_NHWC)
+
+
+def _unknown_size_error(node: Node) -> UnsupportedOpError:
+    return UnsupportedOpError(
+        f"cannot convert {node.op} (node {node.name!r}) with strides, dilations and SAME padding of images of any size",
+        issues=[(node.name, node.op)],
+        why="how much is padded follows from the size",
+        fix="build the network for one size, or pad before the convolution, and give it VALID padding",
+    )
 
 
 def _lower_conv2d(node: Node, builder: OnnxBuilder) -> Any:
@@ -159,28 +173,64 @@ def _lower_depthwise(node: Node, builder: OnnxBuilder) -> Any:
 
 
 def _tfjs_convolution(builder: GraphBuilder, node: Node, types: Mapping[str, TensorType]) -> Node:
-    """Pad and a VALID convolution in place of a SAME one whose windows leave a rest, which is less than nothing to pad.
+    """Write a convolution as TensorFlow.js computes it.
 
-    TensorFlow.js on wasm gives zeros for it.
+    A SAME one whose windows leave a rest, which is less than nothing to pad, becomes Pad and a VALID one: on wasm it
+    gives zeros. So does one of strides and dilations, which TensorFlow.js refuses; it reads every n-th pixel only.
     """
+    strides, dilations = (node.attrs[key][1:3] for key in ("strides", "dilations"))
+    both = max(strides) > 1 and max(dilations) > 1
+    pads = _pads(node, types, always=both)
+    if pads is not None:
+        amounts = builder.const(np.array([(0, 0), *pads, (0, 0)], INT32), f"{node.name}/pads")
+        padded = builder.add("Pad", [node.inputs[0], amounts], f"{node.name}/pad")
+        node = replace(node, inputs=(padded, *node.inputs[1:]), attrs={**node.attrs, "padding": "VALID"})
+    if not both:
+        return node
+    if node.attrs["padding"] != "VALID":
+        raise _unknown_size_error(node)
+    shared = [math.gcd(*pair) for pair in zip(strides, dilations, strict=True)]
+    strides, dilations = ([n // s for n, s in zip(each, shared, strict=True)] for each in (strides, dilations))
+    image = _every(builder, node.inputs[0], shared, f"{node.name}/read")
+    both = max(strides) > 1 and max(dilations) > 1  # they share no more divisor: all results, then every n-th of them
+    attrs = {**node.attrs, "strides": (1, *((1, 1) if both else strides), 1), "dilations": (1, *dilations, 1)}
+    if not both:
+        return replace(node, inputs=(image, *node.inputs[1:]), attrs=attrs)
+    whole = builder.add(node.op, [image, *node.inputs[1:]], f"{node.name}/whole", node.origin, **attrs)
+    return Node(node.name, "StridedSlice", (whole, *_steps(builder, strides, node.name)), _ALL, origin=node.origin)
+
+
+def _pads(node: Node, types: Mapping[str, TensorType], *, always: bool) -> list[tuple[int, int]] | None:
+    """What a SAME convolution pads, where its sizes are known and its windows leave a rest, or ``always``."""
     image, kernel = types[node.inputs[0]].shape, types[node.inputs[1]].shape
     if node.attrs["padding"] != "SAME" or image is None or kernel is None:
-        return node
-    pads, rest = [(0, 0)], False
+        return None
+    pads, rest = [], always
     for size, span, stride, dilation in zip(
         image[1:3], kernel[:2], node.attrs["strides"][1:3], node.attrs["dilations"][1:3], strict=True
     ):
         if not isinstance(size, int) or not isinstance(span, int):
-            return node
+            return None
         window = (span - 1) * dilation + 1
         count, before, after = window_padding(size, window, stride, "SAME")
         rest |= (count - 1) * stride + window < size
         pads.append((before, after))
-    if not rest:
-        return node
-    amounts = builder.const(np.array([*pads, (0, 0)], INT32), f"{node.name}/pads")
-    padded = builder.add("Pad", [node.inputs[0], amounts], f"{node.name}/pad")
-    return replace(node, inputs=(padded, *node.inputs[1:]), attrs={**node.attrs, "padding": "VALID"})
+    return pads if rest else None
+
+
+_ALL = {"begin_mask": 0b1111, "end_mask": 0b1111, "ellipsis_mask": 0, "new_axis_mask": 0, "shrink_axis_mask": 0}
+
+
+def _every(builder: GraphBuilder, image: str, steps: Sequence[int], name: str) -> str:
+    """Every n-th row and column of an NHWC image."""
+    if set(steps) == {1}:
+        return image
+    return builder.add("StridedSlice", [image, *_steps(builder, steps, name)], name, None, **_ALL)
+
+
+def _steps(builder: GraphBuilder, steps: Sequence[int], name: str) -> list[str]:
+    zeros, all_steps = np.zeros(4, INT32), np.array((1, *steps, 1), INT32)
+    return [builder.const(a, f"{name}/{k}") for k, a in (("begin", zeros), ("end", zeros), ("steps", all_steps))]
 
 
 def _lower_pool(onnx_op: str) -> Any:

@@ -33,8 +33,19 @@ def _convolutions() -> Iterator[Sample]:
     for padding in ("SAME", "VALID"):
         attrs = {"padding": padding, "strides": (1, 1, 1, 1), "dilations": (1, 2, 2, 1)}
         yield sample("Conv2D", f"{padding}, dilated", image, kernel, **attrs)
+        yield sample("Conv2D", f"{padding}, dilated, any size", any_size(floats(2, 7, 6, 3)), kernel, **attrs)
         refused = {"tensorflow": "its CPU kernel takes no dilations"}
         yield sample("DepthwiseConv2dNative", f"{padding}, dilated", image, kernel, differs=refused, **attrs)
+    for padding, strides, dilations in itertools.product(
+        ("SAME", "VALID"), ((2, 2), (1, 2), (3, 2)), ((2, 2), (2, 1), (4, 3))
+    ):
+        attrs = {"padding": padding, "strides": (1, *strides, 1), "dilations": (1, *dilations, 1)}
+        named = f"{padding}, strides {strides}, dilations {dilations}"
+        wide = floats(2, 13, 12, 3)
+        yield sample("Conv2D", named, wide, kernel, **attrs)
+        refused = "SAME pads by the size of the image"
+        differs = dict.fromkeys(("onnxruntime", "tfjs-cpu", "tfjs-wasm", "js"), refused) if padding == "SAME" else {}
+        yield sample("Conv2D", f"{named}, any size", any_size(wide), kernel, differs=differs, **attrs)
     yield sample(
         "Conv2D", "strides differ", image, const(floats(4, 4, 3, 2, seed=1)), padding="SAME", strides=(1, 2, 1, 1)
     )
