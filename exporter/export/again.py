@@ -40,6 +40,12 @@ from signatures.fields import printable
 from signatures.roles import Role
 from signatures.spec import PolicySignature
 
+#: Of a bundle whose policy is not made from its source by any choice that is known.
+OWN_REFERENCE = (
+    "the source gives other inputs and outputs: the bundle was exported with options; what the source's own tensors do "
+    "not answer is held against the bundle's own {}, and so is what is drawn"
+)
+
 
 class _Given(Struct, frozen=True):
     """What a bundle is held against.
@@ -134,11 +140,20 @@ def verify_folder(
             f"made for {case.made_for}: its bytes and what the consumer's checkers say were verified; its numbers were "
             "compared when it was exported, and are again with --source FILE",
         )
-    if source is None:
-        report = replace(report, reference=f"{own.key}/{KERNELS}", self_consistent=False)
-        report = _with_note(report, f"the source was not given: the reference is {reference_text(report)}")
+    report = _with_own_reference(report, case, given, own)
     report = replace(report, played=read_plays(folder))
     return _unless_unverified(report, case, None if allow_unverified or runtimes == "none" else runtimes)
+
+
+def _with_own_reference(report: ParityReport, case: _Case, given: _Given, own: Format) -> ParityReport:
+    """The report, which says what of it was held against the bundle's own file, if anything was."""
+    if given.source is not None and (given.again is not None or case.judge is None):
+        return report
+    if given.original is None:
+        report = replace(report, reference=f"{own.key}/{KERNELS}", self_consistent=False)
+    if given.source is None:
+        return _with_note(report, f"the source was not given: the reference is {reference_text(report)}")
+    return _with_note(report, OWN_REFERENCE.format(own.main_of(case.bundle.name)))
 
 
 def _with_note(report: ParityReport, note: str) -> ParityReport:
@@ -169,14 +184,16 @@ def _evidence_of(found: Bundle, read: Source) -> _Given:
         return _Given(read, _original_of(read, contract), baked_again(read, contract))
     if made_for is None:
         original = _original_of(read, contract)
-        _check_meaning(read, contract, found.folder)
-        judged = own_reference([f.key for f in WRITTEN.values() if found.has(f)])
         try:
-            return _Given(read, original, compiled_again(read, contract) if judged is None else None)
+            again = compiled_again(read, contract)
         except BundleError:  # it was exported with options that no contract keeps
-            if original is None:
+            _check_meaning(read, contract, found.folder)
+            if original is None and own_reference([f.key for f in WRITTEN.values() if found.has(f)]) is None:
                 raise
             return _Given(read, original)
+        if any(ours != its for _, ours, its in _meanings(contract.signature, again.policy.signature)):
+            _check_meaning(read, contract, found.folder)
+        return _Given(read, original, again)
     wanted = consumer(made_for)
     if wanted.own_names.isdisjoint(f.key for f in WRITTEN.values() if found.has(f)):
         # Names of a consumer are not those of the source: what it was made from is dressed anew, and held against it.

@@ -174,9 +174,10 @@ def participants_of(
     if reference.original is not None:  # else it would be held against itself
         yield reference.participant("reference", reference.asked, path=tested.reference)
     pairs = [(kind, r) for kind in tested.artefacts for r in WRITTEN[kind].runtimes if not unfit_reason(r, tested)]
-    # A .bytes in numpy is the reference; what runs nowhere else does so there.
-    alone = [k for k in tested.artefacts if WRITTEN[k].runtimes == ("numpy",)]
-    taking_part = [(k, r) for k, r in pairs if (r in runtimes and r != "numpy") or k in alone]
+    # A .bytes in numpy may be the reference; what runs nowhere else does so there.
+    held = [k for k in tested.artefacts if tested.reference not in (tested.artefacts[k], tested.files.get(k))]
+    held += [k for k in tested.artefacts if WRITTEN[k].runtimes == ("numpy",)]
+    taking_part = [(k, r) for k, r in pairs if (k in held if r == "numpy" else r in runtimes)]
     # The others run while TensorFlow is still being imported; ``in_order`` puts the report right again.
     for kind, runtime in sorted(taking_part, key=lambda pair: pair[1] == _SLOWEST):
         path = tested.artefacts[kind]
