@@ -71,14 +71,15 @@ def compare(
     ``free`` marks elements where the answer is as right, by the rule that says so. ``narrowed`` allows int32 for int64.
     ``most`` are bounds per column that go before larger ones. ``rounding`` is an absolute difference per element that
     float32 itself explains; where it is larger than the tolerance it takes its place, up to ``ceiling``. A NaN or
-    infinity must stand at the same place on both sides; a NaN beside a finite number is right by one rule alone.
+    infinity must stand at the same place on both sides; a NaN beside a finite number is forgiven by no rule, and by one
+    it is not proven wrong.
     """
     if (other := _other_kind(reference, candidate, narrowed=narrowed)) is not None:
         return other
     if not reference.size:
         return Difference(0.0, 0.0, True)
     a, b = candidate.astype(np.float64), reference.astype(np.float64)
-    masks = [(e, mask if e.of_nan else mask & ~(np.isnan(a) & np.isfinite(b))) for e, mask in free]
+    masks = [(e, mask if e.unproven else mask & ~(np.isnan(a) & np.isfinite(b))) for e, mask in free]
     freed = np.logical_or.reduce([mask for _, mask in masks]) if masks else np.zeros(a.shape, bool)
     odd, nan = ~np.isfinite(a) | ~np.isfinite(b), np.isnan(a) & np.isnan(b)
     one_sided = odd & ~(nan | (a == b))

@@ -1,9 +1,8 @@
 """What forgives a difference: a rule with a name each, asked in this order, that says which elements it forgave.
 
 A rule that has no number of its own to hold an answer to leaves an element open: the verdict counts those. Rounding
-forgives no more than an output varies over typical inputs, no rule a class that is not as good, and one alone a NaN
-beside a number: where our own kernels make NaN of a number that is taken for zero.
-docs/agreement.md has a row for each.
+forgives no more than an output varies over typical inputs, no rule a class that is not as good. A NaN beside a number
+agrees by none: where arithmetic explains it, the output is not verified. docs/agreement.md has a row for each.
 """
 
 from __future__ import annotations
@@ -22,8 +21,8 @@ class Excuse(Struct, frozen=True):
     leaves_open: bool
     what: str
     hides: str
-    #: It may forgive a NaN beside a finite number.
-    of_nan: bool = False
+    #: It explains a NaN or infinity beside a finite number: that is no fault of a file, and no agreement.
+    unproven: bool = False
 
 
 ZERO_INPUTS = Excuse(
@@ -60,15 +59,15 @@ NOT_FROM_ZERO = Excuse(
     "not told from zero",
     True,
     "at far inputs, between what taking for zero, keeping, and float64 make of numbers that a runtime cannot tell from "
-    "zero, or as far beyond: log(sigmoid(−30))",
+    "zero, or as far beyond: log(sigmoid(−30)); NaN beside infinity where they taken for zero make NaN",
     "the logarithm of nearly nothing as any other, at far inputs alone",
 )
 NAN_FROM_ZERO = Excuse(
     "NaN of what is not told from zero",
     True,
-    "at far inputs, NaN or infinity where such numbers taken for zero make NaN in our own kernels: log(0) − log(0)",
-    "NaN there, at far inputs alone",
-    of_nan=True,
+    "at far inputs, NaN or infinity beside a number where such numbers taken for zero make NaN: log(0) − log(0)",
+    "nothing: the output is not verified",
+    unproven=True,
 )
 NO_DEVIATION = Excuse(
     "NaN in the reference alone",

@@ -296,8 +296,10 @@ class Trial:
         reference, candidate = self._comparable({name: expected[name]})[name], self._comparable({name: got})[name]
         free = self._open_choices(name, expected, got, participant, rounding or {}, hulls or {})
         if hulls and name in hulls and got.dtype.kind == "f" and got.shape == reference.shape:
-            nan = hulls[name].nan & ~(np.isfinite(candidate) & np.isfinite(reference))
-            free = [*free, (NOT_FROM_ZERO, hulls[name].holds(candidate)), (NAN_FROM_ZERO, nan)]
+            numbers = np.isfinite(candidate), np.isfinite(reference)
+            none = hulls[name].nan & ~(numbers[0] | numbers[1])
+            one = hulls[name].nan & (numbers[0] ^ numbers[1])
+            free = [*free, (NOT_FROM_ZERO, hulls[name].holds(candidate) | none), (NAN_FROM_ZERO, one)]
         return compare(
             reference,
             candidate,

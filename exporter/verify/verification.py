@@ -104,12 +104,22 @@ def _findings(
         session.progress(f"{trial.tested.name}: {participant.name} in {participant.runtime}")
         try:
             for check in checks:
-                findings += check(trial, participant)
+                made = list(check(trial, participant))
+                findings += [*made, *_unproven(made)]
         except RunFailedError as error:
             add_failure(participant.name, participant.runtime, error, "*")
         finally:
             trial.bisector.close()
     return findings
+
+
+def _unproven(findings: Sequence[Finding]) -> Iterator[Finding]:
+    """Findings of outputs that passed though NaN or infinity stands beside a number: they are not verified."""
+    for found in findings:
+        for each in (f for f in found.forgiven if found.passed and f.excuse.unproven):
+            reason = f"NaN or infinity beside a number in {each.elements:,} of {found.elements:,} elements of "
+            reason += f"{found.output}, at far inputs: {each.excuse.title}"
+            yield undecided_finding(found.format, found.runtime, found.output, reason)
 
 
 def _report(
