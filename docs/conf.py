@@ -1,6 +1,6 @@
 """How Sphinx builds the site: ``make docs``. Nothing is fetched, neither to build it nor to view it."""
 
-from exporter import __version__
+from export_model.exporter import __version__
 
 project = "export-model"
 copyright = "the authors of export-model, Apache-2.0"

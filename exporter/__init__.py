@@ -1,6 +1,6 @@
 """export-model: trained policies for every runtime, proven to act the same.
 
-``import export_model`` is what users import; ``from exporter import export_model, …`` has the same with flat keywords.
+``import export_model`` is what users import; ``from export_model.exporter import export_model, …`` has the same with flat keywords.
 Nothing heavy is imported before it is used: a cold start is a feature.
 """
 
@@ -16,17 +16,17 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
-    from exporter.acting.loading import load_policy
-    from exporter.api import compare_artefacts, export_model, inspect_model, verify_bundle
+    from export_model.exporter.acting.loading import load_policy
+    from export_model.exporter.api import compare_artefacts, export_model, inspect_model, verify_bundle
 
 __all__ = ["__version__", "compare_artefacts", "export_model", "inspect_model", "load_policy", "verify_bundle"]
 
-_HOMES = {"load_policy": "exporter.acting.loading"}
+_HOMES = {"load_policy": "export_model.exporter.acting.loading"}
 
 
 def __getattr__(name: str) -> Any:
     if name in __all__:
-        return getattr(importlib.import_module(_HOMES.get(name, "exporter.api")), name)
+        return getattr(importlib.import_module(_HOMES.get(name, "export_model.exporter.api")), name)
     raise AttributeError(f"module 'exporter' has no attribute {name!r}")
 
 

@@ -6,17 +6,17 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypedDict, Unpack
 
-from converters.compiler.options import CompileOptions
-from converters.formats.source import ReadOptions as FileOptions
-from exporter import interface
-from exporter.compare import comparison
-from exporter.export.labels import Labels
-from exporter.export.pipeline import ExportResult
-from exporter.inspect.inspection import Inspection
-from exporter.options import ReadOptions, WriteOptions
-from exporter.verify.options import VerifyOptions
-from exporter.verify.report import ParityReport
-from signatures.roles import Role
+from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.formats.source import ReadOptions as FileOptions
+from export_model.exporter import interface
+from export_model.exporter.compare import comparison
+from export_model.exporter.export.labels import Labels
+from export_model.exporter.export.pipeline import ExportResult
+from export_model.exporter.inspect.inspection import Inspection
+from export_model.exporter.options import ReadOptions, WriteOptions
+from export_model.exporter.verify.options import VerifyOptions
+from export_model.exporter.verify.report import ParityReport
+from export_model.signatures.roles import Role
 
 
 class _ReadKeywords(TypedDict, total=False):

@@ -10,29 +10,29 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from exporter.acting.loading import load_as
-from exporter.acting.policy import LoadedPolicy
-from exporter.compare.comparison import CompareOptions, compare_artefacts
-from exporter.export.again import verify_folder
-from exporter.export.options import ExportOptions, storage
-from exporter.export.pipeline import ExportResult
-from exporter.export.pipeline import export as run_export
-from exporter.export.sources import Source, live_source
-from exporter.inspect.inspection import Inspection, inspect_source
-from exporter.options import ReadOptions, WriteOptions, compile_options
-from exporter.play.options import PlayOptions
-from exporter.play.play import play_policy
-from exporter.play.report import PlayReport
-from exporter.play.worlds import MakeWorld
-from exporter.remote.fetching import nearby
-from exporter.tables import count_text
-from exporter.verify.options import VerifyOptions
-from exporter.verify.report import ParityReport
-from signatures.code import code_options
-from signatures.errors import ParityError, UsageError
+from export_model.exporter.acting.loading import load_as
+from export_model.exporter.acting.policy import LoadedPolicy
+from export_model.exporter.compare.comparison import CompareOptions, compare_artefacts
+from export_model.exporter.export.again import verify_folder
+from export_model.exporter.export.options import ExportOptions, storage
+from export_model.exporter.export.pipeline import ExportResult
+from export_model.exporter.export.pipeline import export as run_export
+from export_model.exporter.export.sources import Source, live_source
+from export_model.exporter.inspect.inspection import Inspection, inspect_source
+from export_model.exporter.options import ReadOptions, WriteOptions, compile_options
+from export_model.exporter.play.options import PlayOptions
+from export_model.exporter.play.play import play_policy
+from export_model.exporter.play.report import PlayReport
+from export_model.exporter.play.worlds import MakeWorld
+from export_model.exporter.remote.fetching import nearby
+from export_model.exporter.tables import count_text
+from export_model.exporter.verify.options import VerifyOptions
+from export_model.exporter.verify.report import ParityReport
+from export_model.signatures.code import code_options
+from export_model.signatures.errors import ParityError, UsageError
 
 # What a program logs is found under the package's name, whichever module does the job.
-_LOG = logging.getLogger("exporter.api")
+_LOG = logging.getLogger("export_model.exporter.api")
 
 
 def export(

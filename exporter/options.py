@@ -7,11 +7,11 @@ from pathlib import Path
 
 from msgspec import Struct, field
 
-from converters.compiler.options import CompileOptions, NoiseMode
-from converters.formats import source
-from exporter.export.labels import Labels
-from signatures.errors import UsageError
-from signatures.roles import Role, parse_role
+from export_model.converters.compiler.options import CompileOptions, NoiseMode
+from export_model.converters.formats import source
+from export_model.exporter.export.labels import Labels
+from export_model.signatures.errors import UsageError
+from export_model.signatures.roles import Role, parse_role
 
 _NOISE: Mapping[str, NoiseMode] = {"lift": "lift", "keep": "keep", "zero": "zero"}
 

@@ -7,8 +7,8 @@ import re
 from pathlib import Path
 from typing import Any
 
-from converters.files.fetch import read_bytes
-from signatures.errors import SourceError, UsageError
+from export_model.converters.files.fetch import read_bytes
+from export_model.signatures.errors import SourceError, UsageError
 
 _MOST_BYTES = 1 << 20
 #: Parts of a dotted key; tomllib takes the square of their number.

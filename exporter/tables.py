@@ -10,7 +10,7 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from itertools import zip_longest
 
-from signatures.fields import printable
+from export_model.signatures.fields import printable
 
 #: No column is made narrower where words have to be broken.
 _LEAST = 8

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from signatures.spec import PolicySignature
+from export_model.signatures.spec import PolicySignature
 
 Arrays = Mapping[str, npt.NDArray[Any]]
 #: Outputs by name, for feeds and the outputs that are asked for.

@@ -8,7 +8,7 @@ from typing import Any
 
 from msgspec import Struct
 
-from signatures.errors import UsageError
+from export_model.signatures.errors import UsageError
 
 #: What the file of a policy's weights is called that lies beside its source code.
 WEIGHTS_FILE = "{name}.weights.bin"

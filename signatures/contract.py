@@ -19,13 +19,25 @@ import numpy as np
 from msgspec import Meta, Struct, field, to_builtins
 from msgspec.structs import replace
 
-from signatures.bounded import loads
-from signatures.code import CHOICES
-from signatures.fields import WHOLE, Blank, Count, FieldError, Number, Record, Text, Whole, one_of, path_text, read
-from signatures.interface import parse_interface
-from signatures.labels import parse_labels
-from signatures.roles import INPUT_ROLES, Role
-from signatures.spec import Dtype, PolicySignature, SourceMap, TensorSpec, sources
+from export_model.signatures.bounded import loads
+from export_model.signatures.code import CHOICES
+from export_model.signatures.fields import (
+    WHOLE,
+    Blank,
+    Count,
+    FieldError,
+    Number,
+    Record,
+    Text,
+    Whole,
+    one_of,
+    path_text,
+    read,
+)
+from export_model.signatures.interface import parse_interface
+from export_model.signatures.labels import parse_labels
+from export_model.signatures.roles import INPUT_ROLES, Role
+from export_model.signatures.spec import Dtype, PolicySignature, SourceMap, TensorSpec, sources
 
 POLICY, PARITY = "policy.json", "parity.json"
 SCHEMA = 1

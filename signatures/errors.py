@@ -26,7 +26,7 @@ from contextlib import contextmanager
 from operator import index
 from typing import Any
 
-from signatures.fields import printable
+from export_model.signatures.fields import printable
 
 #: Characters of a line of a message: a file may hold names of any length.
 MAX_LINE = 1 << 13

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from signatures.errors import UsageError
+from export_model.signatures.errors import UsageError
 
 if TYPE_CHECKING:
-    from signatures.spec import TensorSpec
+    from export_model.signatures.spec import TensorSpec
 
 
 def id_bounds(spec: TensorSpec) -> tuple[np.ndarray, np.ndarray] | None:

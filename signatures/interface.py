@@ -16,7 +16,7 @@ from typing import Annotated, Any
 from msgspec import Meta, field
 from msgspec.structs import replace
 
-from signatures.fields import Blank, FieldError, Real, Record, Text, path_text, read
+from export_model.signatures.fields import Blank, FieldError, Real, Record, Text, path_text, read
 
 #: Bounds of a contract's interface: terms in all, numbers of one list, characters of metadata.
 MAX_TERMS, MAX_VALUES, MAX_METADATA_CHARACTERS = 4096, 1 << 16, 1 << 18

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Annotated, Any, TypedDict
 
 from msgspec import Meta
 
-from signatures.errors import UsageError
-from signatures.roles import Role
+from export_model.signatures.errors import UsageError
+from export_model.signatures.roles import Role
 
 if TYPE_CHECKING:
-    from signatures.spec import PolicySignature
+    from export_model.signatures.spec import PolicySignature
 
 #: What one text may hold: it is shown on a line, in a page and in comments of code.
 MAX_LENGTH = 120

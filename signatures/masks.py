@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from signatures.roles import Role
-from signatures.spec import PolicySignature
+from export_model.signatures.roles import Role
+from export_model.signatures.spec import PolicySignature
 
 #: Rows that forbid one action, and two; as many at most, drawn from all there are.
 MOST_FORBIDDEN = 64

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from msgspec import Struct
 
-from signatures.fields import Record, Shape, Text
+from export_model.signatures.fields import Record, Shape, Text
 
 
 class SourcePart(Record, frozen=True):

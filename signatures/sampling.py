@@ -16,11 +16,11 @@ from typing import TypeAlias
 import numpy as np
 from msgspec import Struct
 
-from signatures.ids import id_bounds
-from signatures.masks import all_allowed, forbidden, one_allowed, random_masks
-from signatures.pictures import structured_images
-from signatures.roles import OBSERVATIONS, Role
-from signatures.spec import PolicySignature, TensorSpec
+from export_model.signatures.ids import id_bounds
+from export_model.signatures.masks import all_allowed, forbidden, one_allowed, random_masks
+from export_model.signatures.pictures import structured_images
+from export_model.signatures.roles import OBSERVATIONS, Role
+from export_model.signatures.spec import PolicySignature, TensorSpec
 
 BATCHES = (1, 2, 7)
 #: Tried once; with images, which take long, the largest whose pixels are no more than these.

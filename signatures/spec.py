@@ -8,10 +8,10 @@ from typing import Annotated, Any
 import numpy as np
 from msgspec import Meta, Struct, field
 
-from signatures.fields import Many, Number, Record, Shape, Text, Whole, explicit_default, one_of
-from signatures.interface import Interface
-from signatures.memories import SourcePart
-from signatures.roles import OBSERVATIONS, Role
+from export_model.signatures.fields import Many, Number, Record, Shape, Text, Whole, explicit_default, one_of
+from export_model.signatures.interface import Interface
+from export_model.signatures.memories import SourcePart
+from export_model.signatures.roles import OBSERVATIONS, Role
 
 #: What tensors may be of.
 DTYPES = (

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from exporter.cli.main import main
+from export_model.exporter.cli.main import main
 
 ROOT = Path(__file__).resolve().parent.parent
 #: What Python finds the packages by, as an install in place does.

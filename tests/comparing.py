@@ -7,10 +7,10 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
-from converters.runtimes.pool import RuntimePool
-from exporter.compare import comparison
-from exporter.verify.options import VerifyOptions
-from exporter.verify.report import ParityReport
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.compare import comparison
+from export_model.exporter.verify.options import VerifyOptions
+from export_model.exporter.verify.report import ParityReport
 
 
 def compare_artefacts(

@@ -15,10 +15,10 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, settings
 
-from converters.formats.registry import DEFAULTS, WRITTEN
-from converters.policy.policy import Policy
-from converters.runtimes.pool import RuntimePool
-from converters.runtimes.registry import available_runtimes
+from export_model.converters.formats.registry import DEFAULTS, WRITTEN
+from export_model.converters.policy.policy import Policy
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.converters.runtimes.registry import available_runtimes
 from tests.tracing import Tracing
 
 # pytest-xdist gives its workers 80; what a command prints is not to depend on how the tests are run.
@@ -143,14 +143,14 @@ def formats_in(runtimes: Sequence[str]) -> set[str]:
 @pytest.fixture
 def runtimes(pool: RuntimePool, monkeypatch: pytest.MonkeyPatch) -> RuntimePool:
     """All real runtimes; every command that this test runs shares their processes."""
-    for module in ("exporter.export.again", "converters.runtimes.pool"):
+    for module in ("export_model.exporter.export.again", "export_model.converters.runtimes.pool"):
         monkeypatch.setattr(f"{module}.RuntimePool", lambda: contextlib.nullcontext(pool))
     return pool
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _what_is_written_fits_its_schema() -> Iterator[None]:
-    from converters.formats.bundle import bundle
+    from export_model.converters.formats.bundle import bundle
     from tests.reports.validation import check_parity, check_policy
 
     written = bundle.dumps

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from converters.consumers.published import consumer_tables
+from export_model.converters.consumers.published import consumer_tables
 from tests.commands import ROOT
 
 PAGE = ROOT / "docs" / "consumers.md"

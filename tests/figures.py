@@ -24,14 +24,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from converters.runtimes.pool import INDEPENDENT, RuntimePool
-from converters.runtimes.registry import RUNTIMES, available_runtimes
-from exporter.export.pipeline import ExportOptions, export
-from exporter.verify.difference import add_histograms, by_decade
-from exporter.verify.findings import Finding
-from exporter.verify.report import ParityReport
-from signatures.roles import Role
-from signatures.spec import PolicySignature
+from export_model.converters.runtimes.pool import INDEPENDENT, RuntimePool
+from export_model.converters.runtimes.registry import RUNTIMES, available_runtimes
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.verify.difference import add_histograms, by_decade
+from export_model.exporter.verify.findings import Finding
+from export_model.exporter.verify.report import ParityReport
+from export_model.signatures.roles import Role
+from export_model.signatures.spec import PolicySignature
 from tests.corpus.conftest import SHARED, frozen_corpus, genuine_cases
 from tests.faults.page import section
 

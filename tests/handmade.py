@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from converters.files import tensorflow_messages as schema
-from converters.formats.frozen_graph.tensors import from_array
-from converters.graph.nodes import TensorShape
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.formats.frozen_graph.tensors import from_array
+from export_model.converters.graph.nodes import TensorShape
 
 Array = npt.NDArray[Any]
 NodeDef = Any

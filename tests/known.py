@@ -14,9 +14,9 @@ from typing import Any
 
 import pytest
 
-from converters.policy.policy import Policy
-from exporter.export.sources import read_source
-from signatures.errors import ExportModelError
+from export_model.converters.policy.policy import Policy
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.errors import ExportModelError
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 ABSENT = "../shared (public models, genuine graphs) is not beside this checkout"

@@ -17,26 +17,26 @@ from dataclasses import replace as again
 import numpy as np
 import onnx
 
-from converters.compiler.passes.fold import fold
-from converters.compiler.passes.normalise import normalise
-from converters.compiler.targets import PROGRAM, prepare
-from converters.files import tensorflow_messages as schema
-from converters.formats.format import WriteOptions
-from converters.formats.litert.flatbuffer import decode
-from converters.formats.litert.schema import OPERATOR_NAMES
-from converters.formats.registry import WRITTEN
-from converters.graph import ops as families
-from converters.graph import program as loops
-from converters.graph.nodes import Graph, Node, TensorShape
-from converters.graph.ops.approximations import APPROXIMATIONS
-from converters.graph.ops.barracuda.vocabulary import Activation, LayerType
-from converters.graph.ops.base import written_as_older
-from converters.graph.ops.table import TABLE
-from converters.graph.run import run_graph
-from converters.graph.types import FLOAT32
-from converters.policy.policy import Policy
-from signatures.code import CodeOptions
-from signatures.errors import UnsupportedOpError
+from export_model.converters.compiler.passes.fold import fold
+from export_model.converters.compiler.passes.normalise import normalise
+from export_model.converters.compiler.targets import PROGRAM, prepare
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.formats.format import WriteOptions
+from export_model.converters.formats.litert.flatbuffer import decode
+from export_model.converters.formats.litert.schema import OPERATOR_NAMES
+from export_model.converters.formats.registry import WRITTEN
+from export_model.converters.graph import ops as families
+from export_model.converters.graph import program as loops
+from export_model.converters.graph.nodes import Graph, Node, TensorShape
+from export_model.converters.graph.ops.approximations import APPROXIMATIONS
+from export_model.converters.graph.ops.barracuda.vocabulary import Activation, LayerType
+from export_model.converters.graph.ops.base import written_as_older
+from export_model.converters.graph.ops.table import TABLE
+from export_model.converters.graph.run import run_graph
+from export_model.converters.graph.types import FLOAT32
+from export_model.converters.policy.policy import Policy
+from export_model.signatures.code import CodeOptions
+from export_model.signatures.errors import UnsupportedOpError
 from tests.barracuda.nn_running import action_model, as_policy
 from tests.commands import ROOT
 from tests.graph.harness import policy_of, program_of

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from converters.formats.bundle.bundle import Bundle
-from exporter.serve.scenes import scene_of
-from exporter.serve.site import PREVIEWS, assemble_one_file
+from export_model.converters.formats.bundle.bundle import Bundle
+from export_model.exporter.serve.scenes import scene_of
+from export_model.exporter.serve.site import PREVIEWS, assemble_one_file
 from fixtures.trained import run_folder
 from tests.commands import export_model
 from tests.serve.browsing import visit

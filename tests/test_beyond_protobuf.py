@@ -7,21 +7,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.formats.registry import WRITTEN
-from converters.formats.saved_model.writer import DETERMINISTIC, SERVING
-from converters.graph.run import run_graph
-from converters.runtimes.pool import RuntimePool
-from exporter.export.pipeline import ExportOptions, export
-from exporter.export.sources import read_source
+from export_model.converters.formats.registry import WRITTEN
+from export_model.converters.formats.saved_model.writer import DETERMINISTIC, SERVING
+from export_model.converters.graph.run import run_graph
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.errors import TooLargeError
+from export_model.signatures.sampling import draw_cases
 from fixtures import path as fixture
-from signatures.errors import TooLargeError
-from signatures.sampling import draw_cases
 
 
 @pytest.fixture(autouse=True)
 def _low_limit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("converters.files.external_data.MAX_MESSAGE", 10_000)
-    monkeypatch.setattr("converters.files.external_data.LARGE_FILE", 10_000)
+    monkeypatch.setattr("export_model.converters.files.external_data.MAX_MESSAGE", 10_000)
+    monkeypatch.setattr("export_model.converters.files.external_data.LARGE_FILE", 10_000)
 
 
 def test_weights_lie_beside_the_model_and_the_runtimes_find_them(tmp_path: Path, pool: RuntimePool) -> None:

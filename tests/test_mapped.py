@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.files.external_data import LARGE_FILE
-from converters.files.fetch import read_bytes
-from converters.files.memory_mapped import Mapped
-from exporter import export_model
+from export_model.converters.files.external_data import LARGE_FILE
+from export_model.converters.files.fetch import read_bytes
+from export_model.converters.files.memory_mapped import Mapped
+from export_model.exporter import export_model
+from export_model.signatures.errors import DamagedFileError, SourceError
 from fixtures import path as fixture
-from signatures.errors import DamagedFileError, SourceError
 
 
 def test_a_large_file_is_a_view_which_outlives_being_let_go(tmp_path: Path) -> None:
@@ -62,7 +62,7 @@ def test_what_was_let_go_takes_no_memory(tmp_path: Path) -> None:
 
 
 def test_both_are_looked_into_by_their_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("converters.files.memory_mapped.LARGE_FILE", 1)
+    monkeypatch.setattr("export_model.converters.files.memory_mapped.LARGE_FILE", 1)
     seen = set[tuple[str, type]]()
     read = Mapped.read
 

@@ -11,7 +11,7 @@ from tests.commands import ROOT, python
 SCRIPT = """
 import sys
 from google.protobuf.internal import api_implementation
-from converters.files.protobuf_messages import message_classes
+from export_model.converters.files.protobuf_messages import message_classes
 
 classes = message_classes(
     "tried",
@@ -55,8 +55,8 @@ def test_a_policy_is_read_and_written_in_either(
     implementation: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("PROTOCOL_BUFFERS_PYTHON_IMPLEMENTATION", implementation)
-    first = python("-m", "exporter", ROOT / "fixtures" / "continuous.bytes", "-o", tmp_path, "--verify", "none")
+    first = python("-m", "export_model", ROOT / "fixtures" / "continuous.bytes", "-o", tmp_path, "--verify", "none")
     assert first.status == 0, first.err
     for name in ("continuous.onnx", "saved_model"):
-        again = python("-m", "exporter", tmp_path / "continuous" / name, "-o", tmp_path / name, "--verify", "none")
+        again = python("-m", "export_model", tmp_path / "continuous" / name, "-o", tmp_path / name, "--verify", "none")
         assert again.status == 0, again.err

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.files import tensorflow_messages as schema
-from converters.files.chunks import Pieces, equal
-from converters.files.external_data import LARGE, LARGE_FILE, Detached
-from converters.formats.frozen_graph.reader import read_graph
-from exporter import export_model
-from signatures.digest import sha256_hex
-from signatures.errors import DamagedFileError
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.files.chunks import Pieces, equal
+from export_model.converters.files.external_data import LARGE, LARGE_FILE, Detached
+from export_model.converters.formats.frozen_graph.reader import read_graph
+from export_model.exporter import export_model
+from export_model.signatures.digest import sha256_hex
+from export_model.signatures.errors import DamagedFileError
 from tests.bench.big_policies import KINDS
 from tests.handmade import constant, graph_def
 

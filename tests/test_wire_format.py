@@ -13,8 +13,17 @@ from google.protobuf.unknown_fields import UnknownFieldSet
 from hypothesis import given
 from hypothesis import strategies as st
 
-from converters.files.protobuf_messages import message_classes
-from converters.files.wire_format import BYTES, LONG, SHORT, VARINT, CutOffError, WireError, message_fields, read_varint
+from export_model.converters.files.protobuf_messages import message_classes
+from export_model.converters.files.wire_format import (
+    BYTES,
+    LONG,
+    SHORT,
+    VARINT,
+    CutOffError,
+    WireError,
+    message_fields,
+    read_varint,
+)
 
 NOTHING = message_classes("nothing_walked", {"Nothing": "536870911 none bool"}, {}, "proto3")["Nothing"]
 NUMBERS = st.integers(1, (1 << 29) - 2)

@@ -11,9 +11,9 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from converters.files import yaml_data
-from converters.files.yaml_data import read_yaml
-from signatures.errors import DamagedFileError, SourceError
+from export_model.converters.files import yaml_data
+from export_model.converters.files.yaml_data import read_yaml
+from export_model.signatures.errors import DamagedFileError, SourceError
 
 _LEAVES = st.none() | st.booleans() | st.integers(-(2**70), 2**70) | st.floats(allow_nan=False) | st.text(max_size=12)
 _TREES = st.recursive(

@@ -13,9 +13,7 @@ from typing import Any, Final
 
 import pytest
 
-import converters
-import exporter
-import signatures
+from export_model import converters, exporter, signatures
 
 #: Where one file after the other runs the same lines, coverage traces one in so many.
 TRACED: Final = {"corpus": 8, "legacy": 8, "slow": 4}

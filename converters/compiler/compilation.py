@@ -7,14 +7,14 @@ from collections.abc import Callable, Mapping
 from msgspec import Struct, field
 from msgspec.structs import replace
 
-from converters.compiler.options import CompileOptions
-from converters.graph.nodes import Graph, SourceName
-from converters.policy.action import ActionMeaning
-from converters.policy.brains import Brain
-from converters.policy.facts import SourceFacts
-from signatures.memories import SourcePart
-from signatures.roles import Role
-from signatures.spec import PolicySignature
+from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.graph.nodes import Graph, SourceName
+from export_model.converters.policy.action import ActionMeaning
+from export_model.converters.policy.brains import Brain
+from export_model.converters.policy.facts import SourceFacts
+from export_model.signatures.memories import SourcePart
+from export_model.signatures.roles import Role
+from export_model.signatures.spec import PolicySignature
 
 Dims = tuple[int | None, ...]
 

@@ -8,36 +8,36 @@ from typing import Any
 import numpy as np
 from msgspec.structs import replace
 
-from converters.compiler.compilation import Compilation, Pass, on_graph, on_inputs, on_tensors
-from converters.compiler.options import MAX_PORTS, CompileOptions
-from converters.compiler.passes import conditions as has
-from converters.compiler.passes.batch_axis import for_any_number, without_agents
-from converters.compiler.passes.best_action import rank_actions
-from converters.compiler.passes.doubles import narrow_doubles
-from converters.compiler.passes.fold import fold
-from converters.compiler.passes.inputs import complete_shapes, give_rows, set_values, settle_inputs
-from converters.compiler.passes.memories import Joined, join_memories
-from converters.compiler.passes.mixtures import settle_mixtures
-from converters.compiler.passes.naming import name_ports
-from converters.compiler.passes.noise import clear_seeds, settle_noise, settle_single_draws
-from converters.compiler.passes.normalise import normalise
-from converters.compiler.passes.outputs import derive_outputs, leave_out_without_rows, without_chance
-from converters.compiler.passes.passed_through import drop_passed_through
-from converters.compiler.passes.ranks import settle_ranks
-from converters.compiler.passes.signature import sign, source_map, understand_actions
-from converters.compiler.passes.simplify import collapse_views, drop_identities
-from converters.compiler.passes.small_integers import widen_small_integers
-from converters.compiler.passes.transposes import cancel_transposes
-from converters.compiler.passes.unroll import MAX_NODES, unroll
-from converters.graph.nodes import Graph, Node, SourceName, node_of, split_ref, topological
-from converters.graph.ops.table import is_fed
-from converters.policy.brains import Brain, explain_outputs, find_brains
-from converters.policy.facts import SourceFacts
-from converters.policy.inputs import classify_inputs, explain_inputs
-from converters.policy.policy import Policy
-from converters.policy.rules import Decision
-from signatures.errors import NotAPolicyError, UsageError
-from signatures.roles import OBSERVATIONS
+from export_model.converters.compiler.compilation import Compilation, Pass, on_graph, on_inputs, on_tensors
+from export_model.converters.compiler.options import MAX_PORTS, CompileOptions
+from export_model.converters.compiler.passes import conditions as has
+from export_model.converters.compiler.passes.batch_axis import for_any_number, without_agents
+from export_model.converters.compiler.passes.best_action import rank_actions
+from export_model.converters.compiler.passes.doubles import narrow_doubles
+from export_model.converters.compiler.passes.fold import fold
+from export_model.converters.compiler.passes.inputs import complete_shapes, give_rows, set_values, settle_inputs
+from export_model.converters.compiler.passes.memories import Joined, join_memories
+from export_model.converters.compiler.passes.mixtures import settle_mixtures
+from export_model.converters.compiler.passes.naming import name_ports
+from export_model.converters.compiler.passes.noise import clear_seeds, settle_noise, settle_single_draws
+from export_model.converters.compiler.passes.normalise import normalise
+from export_model.converters.compiler.passes.outputs import derive_outputs, leave_out_without_rows, without_chance
+from export_model.converters.compiler.passes.passed_through import drop_passed_through
+from export_model.converters.compiler.passes.ranks import settle_ranks
+from export_model.converters.compiler.passes.signature import sign, source_map, understand_actions
+from export_model.converters.compiler.passes.simplify import collapse_views, drop_identities
+from export_model.converters.compiler.passes.small_integers import widen_small_integers
+from export_model.converters.compiler.passes.transposes import cancel_transposes
+from export_model.converters.compiler.passes.unroll import MAX_NODES, unroll
+from export_model.converters.graph.nodes import Graph, Node, SourceName, node_of, split_ref, topological
+from export_model.converters.graph.ops.table import is_fed
+from export_model.converters.policy.brains import Brain, explain_outputs, find_brains
+from export_model.converters.policy.facts import SourceFacts
+from export_model.converters.policy.inputs import classify_inputs, explain_inputs
+from export_model.converters.policy.policy import Policy
+from export_model.converters.policy.rules import Decision
+from export_model.signatures.errors import NotAPolicyError, UsageError
+from export_model.signatures.roles import OBSERVATIONS
 
 FOLD = Pass("fold", on_graph(fold), (has.no_control_flow,), (has.constants_folded,))
 DROP = Pass(

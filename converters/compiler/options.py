@@ -7,7 +7,7 @@ from typing import Literal
 
 from msgspec import Struct, field
 
-from signatures.roles import Role
+from export_model.signatures.roles import Role
 
 #: A policy's placeholders, and its outputs.
 MAX_PORTS = 1 << 10

@@ -11,23 +11,28 @@ from functools import partial
 
 from msgspec import Struct
 
-from converters.compiler.passes.batch_branches import join_branches
-from converters.compiler.passes.clip_by_value import clip_by_value
-from converters.compiler.passes.constant_chains import drop_zero_biases, merge_constants, share, square_differences
-from converters.compiler.passes.fuse import fuse
-from converters.compiler.passes.int8_products import multiply_products
-from converters.compiler.passes.layout_views import transpose_layout_views
-from converters.compiler.passes.lowering import (
+from export_model.converters.compiler.passes.batch_branches import join_branches
+from export_model.converters.compiler.passes.clip_by_value import clip_by_value
+from export_model.converters.compiler.passes.constant_chains import (
+    drop_zero_biases,
+    merge_constants,
+    share,
+    square_differences,
+)
+from export_model.converters.compiler.passes.fuse import fuse
+from export_model.converters.compiler.passes.int8_products import multiply_products
+from export_model.converters.compiler.passes.layout_views import transpose_layout_views
+from export_model.converters.compiler.passes.lowering import (
     lower_for_conversion,
     lower_for_importers,
     lower_for_nn,
     lower_for_tfjs,
 )
-from converters.compiler.passes.slice_of_concat import parts_for_slices
-from converters.compiler.passes.unjoined_products import keep_products_unjoined
-from converters.graph.nodes import Graph
-from converters.policy.policy import Policy
-from signatures.roles import Role
+from export_model.converters.compiler.passes.slice_of_concat import parts_for_slices
+from export_model.converters.compiler.passes.unjoined_products import keep_products_unjoined
+from export_model.converters.graph.nodes import Graph
+from export_model.converters.policy.policy import Policy
+from export_model.signatures.roles import Role
 
 
 class Outputs(Struct, frozen=True):

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from converters.consumers.profile import Profile
-from converters.consumers.unity.constructs import constructs
-from converters.consumers.unity.readings import MEASURED, misreadings
-from converters.files.chunks import Pieces
-from signatures.errors import ProfileError
+from export_model.converters.consumers.profile import Profile
+from export_model.converters.consumers.unity.constructs import constructs
+from export_model.converters.consumers.unity.readings import MEASURED, misreadings
+from export_model.converters.files.chunks import Pieces
+from export_model.signatures.errors import ProfileError
 
 
 def other_format(profile: Profile, tried: str) -> str:

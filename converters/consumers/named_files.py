@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from converters.formats.format import Artifact, Format, Kernels, WriteOptions
+from export_model.converters.formats.format import Artifact, Format, Kernels, WriteOptions
 
 if TYPE_CHECKING:
-    from converters.policy.policy import Policy
-    from signatures.code import CodeOptions
-    from signatures.spec import PolicySignature
+    from export_model.converters.policy.policy import Policy
+    from export_model.signatures.code import CodeOptions
+    from export_model.signatures.spec import PolicySignature
 
 
 def artifact_of(form: Format, policy: Policy, options: WriteOptions) -> Artifact:
@@ -19,7 +19,7 @@ def artifact_of(form: Format, policy: Policy, options: WriteOptions) -> Artifact
     A policy that was made for a profile keeps its names. Raises GraphError and its like where it cannot be held.
     """
     if form.consumer and not policy.constants:
-        from converters.consumers.mlagents.version2 import dress_nn
+        from export_model.converters.consumers.mlagents.version2 import dress_nn
 
         policy = dress_nn(policy, form.consumer)
     return form.artifact(policy, options)
@@ -28,7 +28,7 @@ def artifact_of(form: Format, policy: Policy, options: WriteOptions) -> Artifact
 def answered_outputs(form: Format, signature: PolicySignature, code: CodeOptions) -> list[str]:
     """Return the outputs of a policy that its artefact in a format answers."""
     if form.consumer:
-        from converters.consumers.mlagents import own_names
+        from export_model.converters.consumers.mlagents import own_names
 
         return own_names.answered_outputs(signature)
     return [s.name for s in signature.outputs] if form.answers is None else form.answers(signature, code)
@@ -38,6 +38,6 @@ def kernels(form: Format, path: Path) -> Kernels | None:
     """Return what runs an artefact of a format by the numpy kernels; None where its graph is run as it is."""
     if not form.consumer:
         return None
-    from converters.consumers.mlagents import own_names
+    from export_model.converters.consumers.mlagents import own_names
 
     return own_names.kernels(path)

@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from converters.consumers.importable import other_format
-from converters.consumers.profile import Profile
-from converters.consumers.unity.checker import UnityVerdict, check_nn, check_onnx
-from converters.consumers.unity.consumers import consumer
-from converters.consumers.unity.onnx_file import parsed_onnx
-from converters.files.chunks import Pieces
-from converters.formats.barracuda.format import parse
-from converters.formats.registry import BARRACUDA, ONNX
-from signatures.errors import ProfileError
+from export_model.converters.consumers.importable import other_format
+from export_model.converters.consumers.profile import Profile
+from export_model.converters.consumers.unity.checker import UnityVerdict, check_nn, check_onnx
+from export_model.converters.consumers.unity.consumers import consumer
+from export_model.converters.consumers.unity.onnx_file import parsed_onnx
+from export_model.converters.files.chunks import Pieces
+from export_model.converters.formats.barracuda.format import parse
+from export_model.converters.formats.registry import BARRACUDA, ONNX
+from export_model.signatures.errors import ProfileError
 
 
 def playable(profile: Profile, files: Mapping[str, Pieces], name: str) -> None:

@@ -7,11 +7,11 @@ from typing import NoReturn
 
 from msgspec import Struct
 
-from converters.compiler.options import NoiseMode
-from converters.formats.format import WriteOptions
-from converters.formats.registry import WRITTEN
-from converters.policy.policy import Policy
-from signatures.errors import ProfileError
+from export_model.converters.compiler.options import NoiseMode
+from export_model.converters.formats.format import WriteOptions
+from export_model.converters.formats.registry import WRITTEN
+from export_model.converters.policy.policy import Policy
+from export_model.signatures.errors import ProfileError
 
 
 class Profile(Struct, frozen=True, eq=False, kw_only=True):
@@ -51,7 +51,7 @@ class Profile(Struct, frozen=True, eq=False, kw_only=True):
         """Return how a writer makes the files of this consumer."""
         misread = frozenset[str]()
         if self.importers:
-            from converters.consumers.unity.readings import misread_ops
+            from export_model.converters.consumers.unity.readings import misread_ops
 
             misread = misread_ops(self.importers)
         return WriteOptions(contract, self.opset, self.name, misread=misread, batch=self.batch)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from functools import partial
 
-from converters.consumers.mlagents import version2, version3
-from converters.consumers.mlagents.tensorflowsharp import Generation, dress
-from converters.consumers.profile import Profile
-from converters.consumers.robots.naming import GODOT_RL, ISAAC_LAB, name_for_godot_rl, name_for_isaac_lab
-from converters.consumers.unity.consumers import editor_hint, purpose_text, releases_for
-from converters.formats.registry import BARRACUDA, FROZEN_GRAPH, ONNX
-from signatures.errors import UsageError, suggestion
+from export_model.converters.consumers.mlagents import version2, version3
+from export_model.converters.consumers.mlagents.tensorflowsharp import Generation, dress
+from export_model.converters.consumers.profile import Profile
+from export_model.converters.consumers.robots.naming import GODOT_RL, ISAAC_LAB, name_for_godot_rl, name_for_isaac_lab
+from export_model.converters.consumers.unity.consumers import editor_hint, purpose_text, releases_for
+from export_model.converters.formats.registry import BARRACUDA, FROZEN_GRAPH, ONNX
+from export_model.signatures.errors import UsageError, suggestion
 
 #: What CoreBrainInternal.cs gave as pictures until 0.4.0b.
 _GREY = "0.4.0 and 0.4.0a give grey ones from 0 to 255, not to 1: use 0.4.0b for those"

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from converters.consumers.profiles import PROFILES
-from converters.consumers.unity.consumers import CONSUMERS, EARLIER
-from converters.consumers.unity.exceptions import exception_of
-from converters.consumers.unity.importers import IMPORTERS
-from converters.consumers.unity.players import PLAYERS, Row
-from converters.consumers.unity.readings import RULES, Reading, Rule
+from export_model.converters.consumers.profiles import PROFILES
+from export_model.converters.consumers.unity.consumers import CONSUMERS, EARLIER
+from export_model.converters.consumers.unity.exceptions import exception_of
+from export_model.converters.consumers.unity.importers import IMPORTERS
+from export_model.converters.consumers.unity.players import PLAYERS, Row
+from export_model.converters.consumers.unity.readings import RULES, Reading, Rule
 
 _THROWN = (Reading.REFUSED, Reading.FAILS)
 

@@ -17,8 +17,8 @@ from typing import TypeAlias
 
 import numpy as np
 
-from converters.files.chunks import Pieces
-from converters.files.wire_format import BYTES, GROUP, GROUP_END, WireError, message_fields, varint
+from export_model.converters.files.chunks import Pieces
+from export_model.converters.files.wire_format import BYTES, GROUP, GROUP_END, WireError, message_fields, varint
 
 #: Field number → the fields of the message that it holds, or None where it is what is detached.
 Fields: TypeAlias = Mapping[int, "Fields | None"]

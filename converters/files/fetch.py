@@ -12,8 +12,8 @@ from collections.abc import Iterable
 from pathlib import Path, PurePath
 from typing import BinaryIO
 
-from signatures.digest import sha256_hex, sha256_of_stream
-from signatures.errors import DamagedFileError, SourceError
+from export_model.signatures.digest import sha256_hex, sha256_of_stream
+from export_model.signatures.errors import DamagedFileError, SourceError
 
 #: Protobuf's own limit; files of other formats that are one have the same.
 MAX_BYTES = (2 << 30) - 1

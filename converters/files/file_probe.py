@@ -12,8 +12,8 @@ from functools import cached_property
 from itertools import islice
 from typing import Any
 
-from converters.files.wire_format import GROUP, GROUP_END, CutOffError, WireError, message_fields
-from signatures.bounded import loads
+from export_model.converters.files.wire_format import GROUP, GROUP_END, CutOffError, WireError, message_fields
+from export_model.signatures.bounded import loads
 
 _HEAD = 4096
 #: How a pickle begins, of protocol 2 on.

@@ -11,8 +11,8 @@ import mmap
 import os
 from pathlib import Path
 
-from converters.files.external_data import LARGE_FILE
-from converters.files.fetch import MAX_BYTES, open_regular_file, read_bytes
+from export_model.converters.files.external_data import LARGE_FILE
+from export_model.converters.files.fetch import MAX_BYTES, open_regular_file, read_bytes
 
 #: Of a system that cannot be told to forget pages, they leave with the view.
 _FORGET: int | None = getattr(mmap, "MADV_DONTNEED", None)

@@ -10,8 +10,8 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from converters.files.wire_format import BYTES, GROUP, GROUP_END, WireError, message_fields
-from signatures.errors import NotAPolicyError
+from export_model.converters.files.wire_format import BYTES, GROUP, GROUP_END, WireError, message_fields
+from export_model.signatures.errors import NotAPolicyError
 
 #: Fields of a file, those of messages in messages too: a graph may have 131,072 nodes, of two dozen each.
 MAX_FIELDS = 3 << 20

@@ -20,7 +20,7 @@ from typing import Any, Literal
 import numpy as np
 from msgspec import Struct
 
-from converters.files.unpickle import (
+from export_model.converters.files.unpickle import (
     KEYS,
     MULTIARRAY,
     NAMES,

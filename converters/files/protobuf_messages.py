@@ -12,7 +12,7 @@ from typing import Any
 
 from google.protobuf import descriptor_pool, message_factory
 
-from converters.files.wire_format import varint
+from export_model.converters.files.wire_format import varint
 
 _SCALARS = {
     "string": 9,

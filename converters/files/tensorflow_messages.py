@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 from google.protobuf.message import DecodeError
 
-from converters.files.chunks import Pieces
-from converters.files.external_data import LARGE_FILE, Detached, Fields
-from converters.files.message_limits import check_size
-from converters.files.protobuf_messages import message_classes
-from converters.files.wire_format import varint
-from signatures.dtypes import DATA_TYPES
-from signatures.errors import DamagedFileError, NotAPolicyError
+from export_model.converters.files.chunks import Pieces
+from export_model.converters.files.external_data import LARGE_FILE, Detached, Fields
+from export_model.converters.files.message_limits import check_size
+from export_model.converters.files.protobuf_messages import message_classes
+from export_model.converters.files.wire_format import varint
+from export_model.signatures.dtypes import DATA_TYPES
+from export_model.signatures.errors import DamagedFileError, NotAPolicyError
 
 #: Nodes of a file, training part and functions included.
 MAX_NODES = 1 << 17

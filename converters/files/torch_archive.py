@@ -19,9 +19,9 @@ from typing import Any, Literal
 import numpy as np
 from msgspec import Struct
 
-from converters.files.unpickle import StorageType, Tensor, unpickle
-from converters.files.zip_archives import ZIP_ERRORS, open_archive
-from signatures.errors import DamagedFileError, NotAPolicyError
+from export_model.converters.files.unpickle import StorageType, Tensor, unpickle
+from export_model.converters.files.zip_archives import ZIP_ERRORS, open_archive
+from export_model.signatures.errors import DamagedFileError, NotAPolicyError
 
 _MAGIC = 0x1950A86A20F9469CFC6C
 _PROTOCOL = 1001

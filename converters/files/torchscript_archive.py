@@ -13,10 +13,10 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
-from converters.files.pickled_objects import unpickle_objects
-from converters.files.torch_archive import Archive, Storage
-from converters.files.unpickle import Function, damaged_error
-from converters.files.zip_archives import entry_of
+from export_model.converters.files.pickled_objects import unpickle_objects
+from export_model.converters.files.torch_archive import Archive, Storage
+from export_model.converters.files.unpickle import Function, damaged_error
+from export_model.converters.files.zip_archives import entry_of
 
 #: Characters of all code; that of a policy has some ten thousands.
 MAX_CODE = 1 << 20

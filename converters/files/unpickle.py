@@ -19,7 +19,7 @@ from typing import IO, Any, Literal
 import numpy as np
 from msgspec import Struct
 
-from signatures.errors import DamagedFileError, NotAPolicyError
+from export_model.signatures.errors import DamagedFileError, NotAPolicyError
 
 #: A checkpoint has some thousands of opcodes; with a critic and an optimizer some ten thousands.
 MAX_OPCODES = 1 << 21

@@ -12,7 +12,7 @@ import math
 from collections.abc import Iterator
 from typing import Any
 
-from signatures.errors import DamagedFileError, RuntimeUnavailableError, SourceError
+from export_model.signatures.errors import DamagedFileError, RuntimeUnavailableError, SourceError
 
 MAX_YAML_BYTES = 4 << 20
 #: Nodes of the tree, an anchor's counted wherever it is named.

@@ -15,22 +15,22 @@ from typing import TYPE_CHECKING, Any
 
 from msgspec import Struct, field
 
-from signatures.code import CodeOptions
+from export_model.signatures.code import CodeOptions
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from converters.compiler.passes.weights import Storage
-    from converters.files.chunks import Pieces
-    from converters.files.fetch import Fetched
-    from converters.files.file_probe import Content
-    from converters.formats.intermediate_tensors import InnerTensors, Loaded
-    from converters.formats.source import ReadOptions, SourceModel
-    from converters.graph.jitter import Jitter
-    from converters.graph.nodes import Graph
-    from converters.policy.policy import Policy
-    from signatures.contract import FileEntry
-    from signatures.spec import PolicySignature
+    from export_model.converters.compiler.passes.weights import Storage
+    from export_model.converters.files.chunks import Pieces
+    from export_model.converters.files.fetch import Fetched
+    from export_model.converters.files.file_probe import Content
+    from export_model.converters.formats.intermediate_tensors import InnerTensors, Loaded
+    from export_model.converters.formats.source import ReadOptions, SourceModel
+    from export_model.converters.graph.jitter import Jitter
+    from export_model.converters.graph.nodes import Graph
+    from export_model.converters.policy.policy import Policy
+    from export_model.signatures.contract import FileEntry
+    from export_model.signatures.spec import PolicySignature
 if not TYPE_CHECKING:  # what asks a record for its signature looks these names up
     Storage = Pieces = Fetched = Content = InnerTensors = Loaded = ReadOptions = SourceModel = Jitter = Graph = (
         Policy
@@ -98,7 +98,7 @@ class Artifact(Struct, frozen=True):
 
     def write(self, folder: Path) -> dict[str, FileEntry]:
         """Write its files to a folder; what each became, by its path. Raises OSError."""
-        from signatures.contract import FileEntry  # it loads numpy
+        from export_model.signatures.contract import FileEntry  # it loads numpy
 
         for parent in dict.fromkeys(relative.rpartition("/")[0] for relative in self.files):
             (folder / parent).mkdir(parents=True, exist_ok=True)

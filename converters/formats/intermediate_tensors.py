@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from msgspec import Struct
 
-from converters.graph.nodes import split_ref
-from converters.graph.ops.samplers import KINDS
+from export_model.converters.graph.nodes import split_ref
+from export_model.converters.graph.ops.samplers import KINDS
 
 if TYPE_CHECKING:
-    from converters.runtimes.pool import RuntimePool
+    from export_model.converters.runtimes.pool import RuntimePool
 if not TYPE_CHECKING:  # what asks a record for its signature looks these names up
     RuntimePool = Any
 

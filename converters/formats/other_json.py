@@ -7,7 +7,7 @@ from typing import Any
 
 from msgspec import Struct
 
-from converters.files.file_probe import Content
+from export_model.converters.files.file_probe import Content
 
 _SAVE_BINARY = "save it in binary: SerializeToString"
 _NETWORK_IN_JAVASCRIPT = "build the same layers in Keras or PyTorch, set the weights from this file, and export that"

@@ -8,17 +8,17 @@ from typing import TypeVar
 
 from msgspec.structs import replace
 
-from converters.files.fetch import Fetched
-from converters.formats.bundle import BUNDLE
-from converters.formats.bundle.bundle import Bundle
-from converters.formats.format import Format, Member, Ports
-from converters.formats.recognise import not_readable, recognise_path
-from converters.formats.registry import FORMATS
-from converters.formats.source import ReadOptions, SourceModel
-from converters.interfaces.merge import merge
-from converters.interfaces.registry import NO_INTERFACE, read_beside
-from signatures.contract import POLICY
-from signatures.errors import BundleError, ExportModelError, RefusedError, SourceError, UsageError, naming
+from export_model.converters.files.fetch import Fetched
+from export_model.converters.formats.bundle import BUNDLE
+from export_model.converters.formats.bundle.bundle import Bundle
+from export_model.converters.formats.format import Format, Member, Ports
+from export_model.converters.formats.recognise import not_readable, recognise_path
+from export_model.converters.formats.registry import FORMATS
+from export_model.converters.formats.source import ReadOptions, SourceModel
+from export_model.converters.interfaces.merge import merge
+from export_model.converters.interfaces.registry import NO_INTERFACE, read_beside
+from export_model.signatures.contract import POLICY
+from export_model.signatures.errors import BundleError, ExportModelError, RefusedError, SourceError, UsageError, naming
 
 _Part = TypeVar("_Part")
 _Made = TypeVar("_Made")

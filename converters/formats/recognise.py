@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from converters.files.fetch import Fetched, unreadable
-from converters.files.file_probe import PICKLES, Content
-from converters.formats.checkpoint import listing
-from converters.formats.format import Format
-from converters.formats.other_json import KINDS, is_kind, keys_of
-from converters.formats.registry import FORMATS
-from signatures.errors import NotAPolicyError, SourceError
+from export_model.converters.files.fetch import Fetched, unreadable
+from export_model.converters.files.file_probe import PICKLES, Content
+from export_model.converters.formats.checkpoint import listing
+from export_model.converters.formats.format import Format
+from export_model.converters.formats.other_json import KINDS, is_kind, keys_of
+from export_model.converters.formats.registry import FORMATS
+from export_model.signatures.errors import NotAPolicyError, SourceError
 
 _UNITY_ASSET = (b"UnityFS", b"UnityRaw", b"UnityWeb", b"%YAML 1.1\n%TAG !u!")
 _UNPACK = "unpack it and give the model inside"

@@ -5,8 +5,8 @@ from __future__ import annotations
 import importlib
 from collections.abc import Collection
 
-from converters.formats.format import Format
-from signatures.errors import UsageError, suggestion
+from export_model.converters.formats.format import Format
+from export_model.signatures.errors import UsageError, suggestion
 
 #: Packages of ``converters``, in the order in which formats are recognised, written and reported.
 ROOMS = (
@@ -28,7 +28,7 @@ ROOMS = (
     "keras",
 )
 FORMATS: tuple[Format, ...] = tuple(
-    found for room in ROOMS for found in importlib.import_module(f"converters.formats.{room}").FORMATS
+    found for room in ROOMS for found in importlib.import_module(f"export_model.converters.formats.{room}").FORMATS
 )
 #: What can be written, by key; and what is, where nobody says what.
 WRITTEN = {f.key: f for f in FORMATS if f.write is not None}

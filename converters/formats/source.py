@@ -10,14 +10,14 @@ from typing import Any
 from msgspec import Struct, field
 from msgspec.structs import replace
 
-from converters.files import tensorflow_messages as schema
-from converters.files.external_data import Detached
-from converters.files.folders import scratch_folder
-from converters.formats.frozen_graph.subgraph import check, subgraph
-from converters.graph.nodes import Graph
-from converters.policy.facts import SourceFacts
-from signatures.errors import ExportModelError
-from signatures.spec import SourceMap
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.files.external_data import Detached
+from export_model.converters.files.folders import scratch_folder
+from export_model.converters.formats.frozen_graph.subgraph import check, subgraph
+from export_model.converters.graph.nodes import Graph
+from export_model.converters.policy.facts import SourceFacts
+from export_model.signatures.errors import ExportModelError
+from export_model.signatures.spec import SourceMap
 
 
 class OriginalRun(Struct, frozen=True):
@@ -60,7 +60,9 @@ class OriginalRun(Struct, frozen=True):
                 try:
                     file = self.copy(folder)
                 except ExportModelError as error:
-                    from converters.files.children.process import RunFailedError  # an export alone starts no process
+                    from export_model.converters.files.children.process import (
+                        RunFailedError,  # an export alone starts no process
+                    )
 
                     raise RunFailedError("cannot be given to its runtime", why=f"{error.what}: {error.why}") from error
                 yield str(file), self.options

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import struct
 
-from converters.files import tensorflow_messages as schema
-from converters.formats.checkpoint.crc32c import crc32c, mask_crc
-from converters.formats.frozen_graph.encode import as_read
-from converters.graph.nodes import Graph
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.formats.checkpoint.crc32c import crc32c, mask_crc
+from export_model.converters.formats.frozen_graph.encode import as_read
+from export_model.converters.graph.nodes import Graph
 
 #: TensorBoard takes every file with "tfevents" in its name; the number is where a writer puts its time.
 FILE_NAME = "events.out.tfevents.0.export-model"

@@ -12,9 +12,9 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from converters.graph.ops.loops.base import Applied, Counter, Element, Number, Reduced
-from converters.graph.program import Place, every
-from converters.graph.types import FLOAT32
+from export_model.converters.graph.ops.loops.base import Applied, Counter, Element, Number, Reduced
+from export_model.converters.graph.program import Place, every
+from export_model.converters.graph.types import FLOAT32
 
 #: Products that are added in one statement, and sums side by side (Mono 6.8, 64 by 64 products, ns for each: 0.158;
 #: 8 by 8: 0.186, 4 by 16: 0.193, 16 by 8: 0.220, without blocks 0.291; RyuJIT of .NET Core 3.1: 0.131 and 0.207).

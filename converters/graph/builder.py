@@ -15,13 +15,22 @@ import numpy as np
 import numpy.typing as npt
 from msgspec.structs import replace
 
-from converters.graph.nodes import Graph, NameScope, Node, SourceName, TensorShape, node_of, ref, topological
-from converters.graph.ops.base import REQUIRED, axis_within
-from converters.graph.ops.table import TABLE, op_of
-from converters.graph.shapes import Types, add_types, outputs_of
-from converters.graph.size_limits import MAX_MADE, Allowance
-from converters.graph.types import FLOAT32, INT32, INT64, Dim, Symbols, TensorType, broadcast
-from signatures.errors import GraphError, UnsupportedOpError
+from export_model.converters.graph.nodes import (
+    Graph,
+    NameScope,
+    Node,
+    SourceName,
+    TensorShape,
+    node_of,
+    ref,
+    topological,
+)
+from export_model.converters.graph.ops.base import REQUIRED, axis_within
+from export_model.converters.graph.ops.table import TABLE, op_of
+from export_model.converters.graph.shapes import Types, add_types, outputs_of
+from export_model.converters.graph.size_limits import MAX_MADE, Allowance
+from export_model.converters.graph.types import FLOAT32, INT32, INT64, Dim, Symbols, TensorType, broadcast
+from export_model.signatures.errors import GraphError, UnsupportedOpError
 
 #: A policy has some hundreds.
 MAX_NODES = 1 << 16

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from msgspec.structs import replace
 
-from converters.graph.builder import Builder
-from converters.graph.nodes import Graph, NameScope, Node, SourceName, topological
-from converters.graph.ops.rewriting import Older, Shape
-from converters.graph.ops.table import is_fed, op_of
-from converters.graph.shapes import add_types
-from converters.graph.types import TensorType
-from signatures.errors import ExportModelError, UnsupportedOpError
+from export_model.converters.graph.builder import Builder
+from export_model.converters.graph.nodes import Graph, NameScope, Node, SourceName, topological
+from export_model.converters.graph.ops.rewriting import Older, Shape
+from export_model.converters.graph.ops.table import is_fed, op_of
+from export_model.converters.graph.shapes import add_types
+from export_model.converters.graph.types import TensorType
+from export_model.signatures.errors import ExportModelError, UnsupportedOpError
 
 
 class Editor(Builder):

@@ -10,11 +10,11 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from converters.graph.nodes import Node
-from converters.graph.ops.approximations import APPROXIMATIONS, RANGES
-from converters.graph.ops.base import OpDef, axes_within
-from converters.graph.ops.linear import matmul
-from converters.graph.shapes import run_kernel
+from export_model.converters.graph.nodes import Node
+from export_model.converters.graph.ops.approximations import APPROXIMATIONS, RANGES
+from export_model.converters.graph.ops.base import OpDef, axes_within
+from export_model.converters.graph.ops.linear import matmul
+from export_model.converters.graph.shapes import run_kernel
 
 #: Of functions that were not measured.
 _ELSE = (4.0, 0.0)

@@ -8,10 +8,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from converters.graph.ops.loops.base import Applied, Number
-from converters.graph.ops.loops.own_math import OWN
-from converters.graph.program import Place
-from converters.graph.types import FLOAT32
+from export_model.converters.graph.ops.loops.base import Applied, Number
+from export_model.converters.graph.ops.loops.own_math import OWN
+from export_model.converters.graph.program import Place
+from export_model.converters.graph.types import FLOAT32
 
 _WORDS = re.compile(r"[^0-9A-Za-z]+")
 _INFIX = {
@@ -63,7 +63,7 @@ class Language(ABC):
     functions: Mapping[str, str] = {}
     #: Products that are added in one statement, in their order: more where a compiler keeps sums in memory between two.
     terms = 1
-    #: Whether constants are read in blocks (``converters.graph.blocks``).
+    #: Whether constants are read in blocks (``export_model.converters.graph.blocks``).
     blocks = False
     #: How a finite float32 stands in an array, where its type is said before.
     element = "{}f"

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from msgspec import Struct, field
 
-from converters.graph.types import TensorType
-from signatures.errors import GraphError
+from export_model.converters.graph.types import TensorType
+from export_model.signatures.errors import GraphError
 
 #: Attribute values: bool, int, float, str, bytes, numpy dtype, ``TensorShape``, ndarray, or a tuple of these.
 AttrValue = Any

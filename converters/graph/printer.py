@@ -13,13 +13,23 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from converters.graph.blocks import LANES, TERMS, Packed, packed_in, stride_of
-from converters.graph.language import Language, bare, comment, identifier
-from converters.graph.nodes import NameScope
-from converters.graph.ops.loops.base import Applied, Counter, Drawn, Element, Expression, Given, Number, Reduced, Tensor
-from converters.graph.ops.loops.own_math import OWN
-from converters.graph.program import Place, Program, Stage, children, every, inline_scalars, split_loop
-from converters.graph.types import BOOL, FLOAT32, INT32
+from export_model.converters.graph.blocks import LANES, TERMS, Packed, packed_in, stride_of
+from export_model.converters.graph.language import Language, bare, comment, identifier
+from export_model.converters.graph.nodes import NameScope
+from export_model.converters.graph.ops.loops.base import (
+    Applied,
+    Counter,
+    Drawn,
+    Element,
+    Expression,
+    Given,
+    Number,
+    Reduced,
+    Tensor,
+)
+from export_model.converters.graph.ops.loops.own_math import OWN
+from export_model.converters.graph.program import Place, Program, Stage, children, every, inline_scalars, split_loop
+from export_model.converters.graph.types import BOOL, FLOAT32, INT32
 
 _LANES = 8
 #: A counter, and a number that is added to it.

@@ -14,8 +14,8 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from converters.graph.nodes import Graph, Node, TensorShape, ref
-from converters.graph.ops.loops.base import (
+from export_model.converters.graph.nodes import Graph, Node, TensorShape, ref
+from export_model.converters.graph.ops.loops.base import (
     DTYPES,
     Applied,
     Counter,
@@ -30,9 +30,9 @@ from converters.graph.ops.loops.base import (
     loop_error,
     number,
 )
-from converters.graph.ops.table import is_fed, op_of
-from converters.graph.shapes import infer_types
-from converters.graph.types import BOOL, FLOAT32, INT64, TensorType
+from export_model.converters.graph.ops.table import is_fed, op_of
+from export_model.converters.graph.shapes import infer_types
+from export_model.converters.graph.types import BOOL, FLOAT32, INT64, TensorType
 
 
 class Place(Struct, eq=False):

@@ -7,12 +7,12 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 import numpy as np
 from msgspec import Struct
 
-from converters.graph.jitter import Jitter
-from converters.graph.nodes import Graph, Node, node_of, normal_ref, reachable, ref
-from converters.graph.ops.base import OpDef
-from converters.graph.ops.table import op_of
-from converters.graph.shapes import run_kernel_as_it_is
-from signatures.errors import GraphError
+from export_model.converters.graph.jitter import Jitter
+from export_model.converters.graph.nodes import Graph, Node, node_of, normal_ref, reachable, ref
+from export_model.converters.graph.ops.base import OpDef
+from export_model.converters.graph.ops.table import op_of
+from export_model.converters.graph.shapes import run_kernel_as_it_is
+from export_model.signatures.errors import GraphError
 
 
 def _upstream_nodes(graph: Graph, fetch: Sequence[str], fed: Collection[str]) -> set[str]:

@@ -10,12 +10,12 @@ from math import inf, prod
 
 import numpy as np
 
-from converters.graph.nodes import Graph, Node, ref
-from converters.graph.ops.base import MISFIT, Kernel, OpDef, misfit, shape_error
-from converters.graph.ops.table import CONTROL_FLOW, op_of
-from converters.graph.size_limits import Allowance
-from converters.graph.types import FLOAT32, INT32, Dim, Symbols, TensorType, of_array
-from signatures.errors import ExportModelError, GraphError
+from export_model.converters.graph.nodes import Graph, Node, ref
+from export_model.converters.graph.ops.base import MISFIT, Kernel, OpDef, misfit, shape_error
+from export_model.converters.graph.ops.table import CONTROL_FLOW, op_of
+from export_model.converters.graph.size_limits import Allowance
+from export_model.converters.graph.types import FLOAT32, INT32, Dim, Symbols, TensorType, of_array
+from export_model.signatures.errors import ExportModelError, GraphError
 
 Types = dict[str, TensorType]
 

@@ -10,10 +10,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from converters.graph.jitter import Jitter
-from converters.graph.nodes import Node
-from converters.graph.ops.approximations import RANGES, TINY
-from converters.graph.ops.base import OpDef
+from export_model.converters.graph.jitter import Jitter
+from export_model.converters.graph.nodes import Node
+from export_model.converters.graph.ops.approximations import RANGES, TINY
+from export_model.converters.graph.ops.base import OpDef
 
 
 class End(Jitter):

@@ -6,8 +6,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain
 from typing import Any
 
-from converters.interfaces.merge import TERM_FIELDS, equal_values
-from signatures.interface import Interface, Quantity, Term
+from export_model.converters.interfaces.merge import TERM_FIELDS, equal_values
+from export_model.signatures.interface import Interface, Quantity, Term
 
 _QUANTITY_FIELDS = ("values", "clip", "elements", "unit")
 #: What a field's numbers belong to, where there is one for each.

@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 
 from msgspec.structs import replace
 
-from converters.interfaces.table import cut_text
-from signatures.interface import Interface, Statement, Term
-from signatures.roles import Role
-from signatures.spec import PolicySignature
+from export_model.converters.interfaces.table import cut_text
+from export_model.signatures.interface import Interface, Statement, Term
+from export_model.signatures.roles import Role
+from export_model.signatures.spec import PolicySignature
 
 
 def fit_interface(

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from typing import TypeVar
 
-from converters.interfaces.table import Table, short_text
-from signatures.interface import Interface, Period, Quantity, Statement, Term
+from export_model.converters.interfaces.table import Table, short_text
+from export_model.signatures.interface import Interface, Period, Quantity, Statement, Term
 
 _Entry = TypeVar("_Entry")
 #: The group of observations that the policy sees, as versions call it.

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from pathlib import PurePosixPath
 
-from converters.interfaces.table import Table, cut_text
-from signatures.interface import Interface, Period, Statement, Term
+from export_model.converters.interfaces.table import Table, cut_text
+from export_model.signatures.interface import Interface, Period, Statement, Term
 
 _TARGETS = "target/"
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from signatures.interface import Interface, Quantity, Term
+from export_model.signatures.interface import Interface, Quantity, Term
 
 #: Numbers that are equal as exporters round them (mjlab: three decimals).
 _ROUNDED = 5.1e-4

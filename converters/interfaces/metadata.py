@@ -10,9 +10,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from converters.interfaces.table import Table, numbers_of, ranges_of
-from signatures.bounded import loads
-from signatures.interface import MAX_METADATA_CHARACTERS, MAX_TERMS, MAX_VALUES, Interface, Quantity, Term
+from export_model.converters.interfaces.table import Table, numbers_of, ranges_of
+from export_model.signatures.bounded import loads
+from export_model.signatures.interface import MAX_METADATA_CHARACTERS, MAX_TERMS, MAX_VALUES, Interface, Quantity, Term
 
 FILE = "metadata_props"
 #: What only such exporters write; other metadata is kept and not read.

@@ -6,9 +6,9 @@ decides is a component's setting in Unity (Decision Requester), and stands in no
 
 from __future__ import annotations
 
-from converters.interfaces.table import Table
-from signatures.interface import Interface, Statement
-from signatures.roles import MEMORY_SIZE
+from export_model.converters.interfaces.table import Table
+from export_model.signatures.interface import Interface, Statement
+from export_model.signatures.roles import MEMORY_SIZE
 
 
 def read_configuration(table: Table, behavior: str) -> Interface:

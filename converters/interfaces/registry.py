@@ -10,17 +10,17 @@ from pathlib import Path
 
 from msgspec import Struct
 
-from converters.files.fetch import inside, read_bytes
-from converters.files.yaml_data import MAX_YAML_BYTES, read_yaml
-from converters.interfaces.isaac_lab import read_agent, read_descriptors, read_environment
-from converters.interfaces.leapp import read_pipeline
-from converters.interfaces.merge import merge
-from converters.interfaces.mlagents import read_configuration
-from converters.interfaces.table import Table
-from converters.interfaces.unitree import read_deploy
-from signatures.errors import DamagedFileError, ExportModelError
-from signatures.fields import printable
-from signatures.interface import Interface
+from export_model.converters.files.fetch import inside, read_bytes
+from export_model.converters.files.yaml_data import MAX_YAML_BYTES, read_yaml
+from export_model.converters.interfaces.isaac_lab import read_agent, read_descriptors, read_environment
+from export_model.converters.interfaces.leapp import read_pipeline
+from export_model.converters.interfaces.merge import merge
+from export_model.converters.interfaces.mlagents import read_configuration
+from export_model.converters.interfaces.table import Table
+from export_model.converters.interfaces.unitree import read_deploy
+from export_model.signatures.errors import DamagedFileError, ExportModelError
+from export_model.signatures.fields import printable
+from export_model.signatures.interface import Interface
 
 #: What ``--interface`` is given to leave out what lies beside a source.
 NO_INTERFACE = "none"

@@ -7,8 +7,8 @@ import math
 from collections.abc import Iterator
 from typing import Any, TypeVar
 
-from signatures.fields import printable
-from signatures.interface import (
+from export_model.signatures.fields import printable
+from export_model.signatures.interface import (
     MAX_KEPT_CHARACTERS,
     MAX_NAME_CHARACTERS,
     MAX_TERMS,

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from signatures.fields import printable
-from signatures.interface import Interface, Quantity, Range, Statement, Term
-from signatures.spec import PolicySignature
+from export_model.signatures.fields import printable
+from export_model.signatures.interface import Interface, Quantity, Range, Statement, Term
+from export_model.signatures.spec import PolicySignature
 
 #: Entries of a list that are shown, where not all are.
 FEW, ALL = 6, 1 << 20

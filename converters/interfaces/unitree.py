@@ -6,8 +6,8 @@ scales has one number for each of the term's, so it states the size.
 
 from __future__ import annotations
 
-from converters.interfaces.table import Table, short_text
-from signatures.interface import Interface, Period, Quantity, Term
+from export_model.converters.interfaces.table import Table, short_text
+from export_model.signatures.interface import Interface, Period, Quantity, Term
 
 _QUANTITIES = {
     "stiffness": "stiffness",

@@ -7,10 +7,10 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from msgspec import Struct
 
-from converters.graph.nodes import Graph, Node, node_of
-from converters.graph.ops.table import passes_on, traits
-from converters.graph.shapes import infer_types
-from signatures.roles import Role
+from export_model.converters.graph.nodes import Graph, Node, node_of
+from export_model.converters.graph.ops.table import passes_on, traits
+from export_model.converters.graph.shapes import infer_types
+from export_model.signatures.roles import Role
 
 _MAX_LEAVES = 1024
 #: Clips of classes one after the other that are looked through: each asks what lies behind it anew.

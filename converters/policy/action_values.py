@@ -11,9 +11,9 @@ from collections.abc import Callable
 
 from msgspec import Struct
 
-from converters.graph.nodes import Graph, Node, normal_ref
-from converters.graph.ops.table import passes_on, traits
-from signatures.roles import Q_NAMES, STATE_VALUE_NAMES, plain_name
+from export_model.converters.graph.nodes import Graph, Node, normal_ref
+from export_model.converters.graph.ops.table import passes_on, traits
+from export_model.signatures.roles import Q_NAMES, STATE_VALUE_NAMES, plain_name
 
 #: Names that say that an output is the action itself, or scores that are drawn from.
 _ACTION_NAMES = re.compile(

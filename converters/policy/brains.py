@@ -13,14 +13,14 @@ import numpy as np
 from msgspec import Struct, field
 from msgspec.structs import replace
 
-from converters.graph.nodes import Graph, Node, node_of
-from converters.graph.ops.table import CONTROL_FLOW, is_fed, passes_on, traits
-from converters.policy.action_values import says_action
-from converters.policy.given_outputs import check_given, outputs_from_user
-from converters.policy.memories import looks_like_state
-from converters.policy.rules import Decision, Rule
-from signatures.errors import NotAPolicyError, SignatureError
-from signatures.roles import (
+from export_model.converters.graph.nodes import Graph, Node, node_of
+from export_model.converters.graph.ops.table import CONTROL_FLOW, is_fed, passes_on, traits
+from export_model.converters.policy.action_values import says_action
+from export_model.converters.policy.given_outputs import check_given, outputs_from_user
+from export_model.converters.policy.memories import looks_like_state
+from export_model.converters.policy.rules import Decision, Rule
+from export_model.signatures.errors import NotAPolicyError, SignatureError
+from export_model.signatures.roles import (
     ACTING,
     ACTION_NAMES,
     CANONICAL,

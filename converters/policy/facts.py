@@ -7,10 +7,10 @@ from typing import Any
 
 from msgspec import Struct, field
 
-from converters.policy.rules import Decision
-from signatures.interface import Interface
-from signatures.memories import SeparateMemory
-from signatures.roles import Constant, Role
+from export_model.converters.policy.rules import Decision
+from export_model.signatures.interface import Interface
+from export_model.signatures.memories import SeparateMemory
+from export_model.signatures.roles import Constant, Role
 
 #: The note of a source that has float64 numbers.
 DOUBLES_NARROWED = "float64 numbers of the source are computed as float32"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 
-from signatures.roles import VERSION_NUMBER
+from export_model.signatures.roles import VERSION_NUMBER
 
 #: What ``version_number`` says from release 17 (0.26.0) on.
 TORCH_VERSION_3 = 3

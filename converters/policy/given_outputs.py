@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 
-from converters.graph.nodes import Graph, normal_ref, split_ref
-from signatures.errors import SignatureError, UsageError
-from signatures.roles import ACTING, OUTPUT_ROLES, Role
+from export_model.converters.graph.nodes import Graph, normal_ref, split_ref
+from export_model.signatures.errors import SignatureError, UsageError
+from export_model.signatures.roles import ACTING, OUTPUT_ROLES, Role
 
 #: The name, role and tensor of an output.
 Output = tuple[str, Role, str]

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from converters.graph.nodes import Graph, Node, node_of
-from converters.graph.ops.table import traits
-from converters.graph.run import run_graph
-from converters.graph.shapes import Types, numbers_made
-from converters.graph.size_limits import MAX_COMPUTED
-from signatures.errors import GraphError
+from export_model.converters.graph.nodes import Graph, Node, node_of
+from export_model.converters.graph.ops.table import traits
+from export_model.converters.graph.run import run_graph
+from export_model.converters.graph.shapes import Types, numbers_made
+from export_model.converters.graph.size_limits import MAX_COMPUTED
+from export_model.signatures.errors import GraphError
 
 #: What a free axis behind the batch counts as.
 _FREE_AXIS = 8

@@ -8,12 +8,12 @@ from collections.abc import Mapping
 import numpy as np
 from msgspec import Struct
 
-from converters.graph.nodes import Graph, Node, downstream
-from converters.graph.ops.table import passes_on, traits
-from converters.policy.memories import looks_like_state
-from converters.policy.observations import highest_colour
-from converters.policy.rules import Rule, always
-from signatures.roles import INPUT_PATTERNS, Role
+from export_model.converters.graph.nodes import Graph, Node, downstream
+from export_model.converters.graph.ops.table import passes_on, traits
+from export_model.converters.policy.memories import looks_like_state
+from export_model.converters.policy.observations import highest_colour
+from export_model.converters.policy.rules import Rule, always
+from export_model.signatures.roles import INPUT_PATTERNS, Role
 
 #: Names of cameras: ML-Agents' own, and words that say so.
 _CAMERA = re.compile(r"^obs_\d+$|^observation_\d+$|visual|camera|image|pixel|rgb|screen|frame")

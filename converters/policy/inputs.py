@@ -9,11 +9,11 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from msgspec.structs import replace
 
-from converters.graph.nodes import Graph, Node, node_of
-from converters.graph.ops.table import is_fed
-from converters.policy.brains import Brain
-from converters.policy.given_outputs import close_names
-from converters.policy.input_rules import (
+from export_model.converters.graph.nodes import Graph, Node, node_of
+from export_model.converters.graph.ops.table import is_fed
+from export_model.converters.policy.brains import Brain
+from export_model.converters.policy.given_outputs import close_names
+from export_model.converters.policy.input_rules import (
     BY_NAME,
     BY_READERS,
     LAST_RESORTS,
@@ -24,9 +24,9 @@ from converters.policy.input_rules import (
     is_free,
     placeholder_rank,
 )
-from converters.policy.rules import Decision, against, first
-from signatures.errors import SignatureError, UsageError
-from signatures.roles import INPUT_ROLES, OBSERVATIONS, Role
+from export_model.converters.policy.rules import Decision, against, first
+from export_model.signatures.errors import SignatureError, UsageError
+from export_model.signatures.roles import INPUT_ROLES, OBSERVATIONS, Role
 
 #: What is said of an input that is its own.
 _TOLD, _KNOWN, _DEFAULT = "--input says so", "the format says so", "it has a value of its own, and nothing names it"

@@ -7,13 +7,13 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
-from converters.graph.nodes import Graph, Node, node_of, ref
-from converters.graph.ops.table import op_of
-from converters.graph.shapes import elements_of, infer_types, run_kernel
-from converters.graph.size_limits import Allowance
-from converters.graph.types import FLOAT32, TensorType, static_shape
-from signatures.errors import GraphError
-from signatures.memories import SeparateMemory
+from export_model.converters.graph.nodes import Graph, Node, node_of, ref
+from export_model.converters.graph.ops.table import op_of
+from export_model.converters.graph.shapes import elements_of, infer_types, run_kernel
+from export_model.converters.graph.size_limits import Allowance
+from export_model.converters.graph.types import FLOAT32, TensorType, static_shape
+from export_model.signatures.errors import GraphError
+from export_model.signatures.memories import SeparateMemory
 
 Shape = tuple[int | None, ...]
 #: Numbers of a memory whose parts are told apart, and those of all that is made of it on the way.

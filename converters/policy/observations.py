@@ -10,8 +10,8 @@ import math
 
 import numpy as np
 
-from converters.graph.nodes import Graph, Node, node_of
-from converters.graph.ops.table import passes_on, traits
+from export_model.converters.graph.nodes import Graph, Node, node_of
+from export_model.converters.graph.ops.table import passes_on, traits
 
 
 def normaliser(graph: Graph, name: str) -> dict[str, object] | None:

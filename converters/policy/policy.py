@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 from msgspec import Struct, field
 
-from converters.graph.nodes import Graph
-from signatures.spec import PolicySignature, SourceMap
+from export_model.converters.graph.nodes import Graph
+from export_model.signatures.spec import PolicySignature, SourceMap
 
 
 class Policy(Struct, frozen=True):

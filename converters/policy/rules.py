@@ -11,7 +11,7 @@ from typing import Generic, TypeVar
 
 from msgspec import Struct
 
-from signatures.roles import Role
+from export_model.signatures.roles import Role
 
 Subject = TypeVar("Subject")
 Verdict = TypeVar("Verdict")

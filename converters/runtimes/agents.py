@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from msgspec import Struct, convert
 
-from converters.files.children.frames import Tensors
-from converters.formats.programs.members import Field, Header
+from export_model.converters.files.children.frames import Tensors
+from export_model.converters.formats.programs.members import Field, Header
 
 #: How many take turns.
 AGENTS = 3

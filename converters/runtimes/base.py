@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from msgspec import Struct
 
 if TYPE_CHECKING:
-    from converters.graph.ops.approximations import Arithmetic
+    from export_model.converters.graph.ops.approximations import Arithmetic
 if not TYPE_CHECKING:  # what asks a record for its signature looks these names up
     Arithmetic = Any
 

@@ -16,9 +16,9 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
-from converters.formats.bundle.exchange import exchange, stage
-from signatures.digest import sha256_hex
-from signatures.errors import RuntimeUnavailableError
+from export_model.converters.formats.bundle.exchange import exchange, stage
+from export_model.signatures.digest import sha256_hex
+from export_model.signatures.errors import RuntimeUnavailableError
 
 #: The file, in the folder, of what was found right: name → the hash and what told then that nothing has changed.
 STAMP = ".export-model-checked.json"

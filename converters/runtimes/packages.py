@@ -6,8 +6,8 @@ import re
 from functools import partial
 from pathlib import Path
 
-from converters.files.children.python import child_command, module_origin
-from converters.runtimes.base import Runtime, RuntimeInfo
+from export_model.converters.files.children.python import child_command, module_origin
+from export_model.converters.runtimes.base import Runtime, RuntimeInfo
 
 
 def package_runtime(
@@ -27,7 +27,7 @@ def package_runtime(
     version.
     """
     folder, *told = child or (name,)
-    command = partial(child_command, f"converters.runtimes.{folder}.child", *told)
+    command = partial(child_command, f"export_model.converters.runtimes.{folder}.child", *told)
     find = partial(_find, name, package or name, how, distributions)
     return Runtime(name, find, command, independent=independent, originals=originals)
 

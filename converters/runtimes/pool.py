@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 
-from converters.files.children.process import RuntimeProcess
-from converters.formats.format import Format
-from converters.runtimes.registry import RUNTIMES, RuntimeInfo, available_runtimes
-from signatures.errors import RuntimeUnavailableError, UsageError, suggestion
+from export_model.converters.files.children.process import RuntimeProcess
+from export_model.converters.formats.format import Format
+from export_model.converters.runtimes.registry import RUNTIMES, RuntimeInfo, available_runtimes
+from export_model.signatures.errors import RuntimeUnavailableError, UsageError, suggestion
 
 #: Runtimes that compute by themselves; numpy and js are this project's own.
 INDEPENDENT = tuple(r.name for r in RUNTIMES if r.independent)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import importlib
 
-from converters.runtimes.base import Runtime, RuntimeInfo
+from export_model.converters.runtimes.base import Runtime, RuntimeInfo
 
 __all__ = ["RUNTIMES", "Runtime", "RuntimeInfo", "available_runtimes"]
 
@@ -27,7 +27,9 @@ ROOMS = (
     "openvino",
 )
 RUNTIMES: tuple[Runtime, ...] = tuple(
-    runtime for room in ROOMS for runtime in importlib.import_module(f"converters.runtimes.{room}").RUNTIMES
+    runtime
+    for room in ROOMS
+    for runtime in importlib.import_module(f"export_model.converters.runtimes.{room}").RUNTIMES
 )
 
 

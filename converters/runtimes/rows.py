@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from converters.files.children.frames import Tensors
-from converters.formats.programs.members import Field, Header
+from export_model.converters.files.children.frames import Tensors
+from export_model.converters.formats.programs.members import Field, Header
 
 OUTSIDE = "an index of {} inputs lies outside of the table that it is looked up in"
 

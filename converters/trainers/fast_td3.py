@@ -9,14 +9,14 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from converters.graph.nn.activations import NAMED
-from converters.graph.nn.normalisation import layer
-from converters.policy.facts import SourceFacts
-from converters.trainers.pytorch.network import Network
-from converters.trainers.pytorch.weights import Weights, pytorch_alone
-from converters.trainers.trainer import Rebuilt, Saved, Trainer
-from signatures.errors import SourceError
-from signatures.roles import Role
+from export_model.converters.graph.nn.activations import NAMED
+from export_model.converters.graph.nn.normalisation import layer
+from export_model.converters.policy.facts import SourceFacts
+from export_model.converters.trainers.pytorch.network import Network
+from export_model.converters.trainers.pytorch.weights import Weights, pytorch_alone
+from export_model.converters.trainers.trainer import Rebuilt, Saved, Trainer
+from export_model.signatures.errors import SourceError
+from export_model.signatures.roles import Role
 
 _FIX = "export fast_td3_deploy.load_policy(CHECKPOINT) to ONNX (torch.onnx.export), and give that"
 _STATE = "actor_state_dict"

@@ -6,9 +6,9 @@ import importlib
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from converters.files.unpickle import Tensor
-from converters.trainers.trainer import Rebuilt, Saved, Trainer
-from signatures.errors import NotAPolicyError, UsageError
+from export_model.converters.files.unpickle import Tensor
+from export_model.converters.trainers.trainer import Rebuilt, Saved, Trainer
+from export_model.signatures.errors import NotAPolicyError, UsageError
 
 #: Rooms of ``converters/trainers``, in the order in which they are asked.
 ROOMS = (
@@ -22,7 +22,9 @@ ROOMS = (
     "sample_factory",
     "scripts",
 )
-TRAINERS: tuple[Trainer, ...] = tuple(importlib.import_module(f"converters.trainers.{room}").TRAINER for room in ROOMS)
+TRAINERS: tuple[Trainer, ...] = tuple(
+    importlib.import_module(f"export_model.converters.trainers.{room}").TRAINER for room in ROOMS
+)
 #: How a tensor's name begins in the checkpoints of trainers whose networks are not rebuilt (Tianshou 2, RLlib 2).
 _OTHERS: Mapping[str, str] = {
     **dict.fromkeys(("actor.preprocess.", "model.model.model."), "Tianshou"),

@@ -13,18 +13,18 @@ from typing import Any
 
 import numpy as np
 
-from converters.files.pickled_objects import Instance, array_of
-from converters.graph.nn.activations import clip
-from converters.graph.nodes import Graph
-from converters.graph.types import FLOAT32
-from converters.policy.facts import SourceFacts
-from converters.trainers.pytorch.network import Network
-from converters.trainers.pytorch.weights import Weights, pytorch_alone
-from converters.trainers.rsl_rl import per_action
-from converters.trainers.settings import Settings
-from converters.trainers.trainer import Rebuilt, Saved, Trainer
-from signatures.errors import DamagedFileError, SourceError
-from signatures.roles import Role
+from export_model.converters.files.pickled_objects import Instance, array_of
+from export_model.converters.graph.nn.activations import clip
+from export_model.converters.graph.nodes import Graph
+from export_model.converters.graph.types import FLOAT32
+from export_model.converters.policy.facts import SourceFacts
+from export_model.converters.trainers.pytorch.network import Network
+from export_model.converters.trainers.pytorch.weights import Weights, pytorch_alone
+from export_model.converters.trainers.rsl_rl import per_action
+from export_model.converters.trainers.settings import Settings
+from export_model.converters.trainers.trainer import Rebuilt, Saved, Trainer
+from export_model.signatures.errors import DamagedFileError, SourceError
+from export_model.signatures.roles import Role
 
 _EXPORT_ONNX = "load it in RLlib, export the module (torch.onnx.export), and give the .onnx"
 _FILE = "class_and_ctor_args.pkl"

@@ -14,14 +14,14 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from converters.graph.nn.activations import Activation
-from converters.graph.nodes import Graph
-from converters.policy.facts import SourceFacts
-from converters.trainers.pytorch.activations import activation_of
-from converters.trainers.pytorch.network import Network
-from converters.trainers.pytorch.weights import TensorFile, Weights, pytorch_alone
-from converters.trainers.trainer import Rebuilt, Saved, Trainer
-from signatures.roles import Role
+from export_model.converters.graph.nn.activations import Activation
+from export_model.converters.graph.nodes import Graph
+from export_model.converters.policy.facts import SourceFacts
+from export_model.converters.trainers.pytorch.activations import activation_of
+from export_model.converters.trainers.pytorch.network import Network
+from export_model.converters.trainers.pytorch.weights import TensorFile, Weights, pytorch_alone
+from export_model.converters.trainers.trainer import Rebuilt, Saved, Trainer
+from export_model.signatures.roles import Role
 
 _USUAL = "rsl_rl's default is elu"
 _EXPORT_ONNX = "export the policy to ONNX in its own project (rsl_rl's exporter, torch.onnx.export), and give that"

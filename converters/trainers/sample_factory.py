@@ -14,17 +14,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from converters.graph.nn.activations import Activation
-from converters.graph.nodes import Graph
-from converters.policy.facts import SourceFacts
-from converters.trainers.pytorch.network import Network
-from converters.trainers.pytorch.weights import Weights, pytorch_alone
-from converters.trainers.rl_games.normaliser import normalise
-from converters.trainers.rsl_rl import per_action
-from converters.trainers.settings import Settings, needed_settings
-from converters.trainers.trainer import Rebuilt, Saved, Trainer
-from signatures.errors import SourceError
-from signatures.roles import Role
+from export_model.converters.graph.nn.activations import Activation
+from export_model.converters.graph.nodes import Graph
+from export_model.converters.policy.facts import SourceFacts
+from export_model.converters.trainers.pytorch.network import Network
+from export_model.converters.trainers.pytorch.weights import Weights, pytorch_alone
+from export_model.converters.trainers.rl_games.normaliser import normalise
+from export_model.converters.trainers.rsl_rl import per_action
+from export_model.converters.trainers.settings import Settings, needed_settings
+from export_model.converters.trainers.trainer import Rebuilt, Saved, Trainer
+from export_model.signatures.errors import SourceError
+from export_model.signatures.roles import Role
 
 _EXPORT_ONNX = (
     "load it in Sample Factory, export the module that gives the action (torch.onnx.export), and give the .onnx"

@@ -8,13 +8,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from converters.files.fetch import Fetched
-from converters.files.file_probe import json_in
-from converters.files.yaml_data import MAX_YAML_BYTES, read_yaml
-from converters.graph.nn.activations import Activation
-from converters.trainers.pytorch.activations import activation_named
-from converters.trainers.trainer import Saved
-from signatures.errors import SourceError
+from export_model.converters.files.fetch import Fetched
+from export_model.converters.files.file_probe import json_in
+from export_model.converters.files.yaml_data import MAX_YAML_BYTES, read_yaml
+from export_model.converters.graph.nn.activations import Activation
+from export_model.converters.trainers.pytorch.activations import activation_named
+from export_model.converters.trainers.trainer import Saved
+from export_model.signatures.errors import SourceError
 
 #: Folders of a run that hold its checkpoints alone: the settings lie one folder up.
 _OF_CHECKPOINTS = re.compile(r"nn|checkpoints|checkpoint_p\d+")

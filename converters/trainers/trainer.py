@@ -11,11 +11,11 @@ from typing import Any
 
 from msgspec import Struct
 
-from converters.files.fetch import Fetched
-from converters.graph.nodes import Graph
-from converters.policy.facts import SourceFacts
-from converters.trainers.pytorch.weights import TensorFile
-from signatures.errors import SourceError, UsageError
+from export_model.converters.files.fetch import Fetched
+from export_model.converters.graph.nodes import Graph
+from export_model.converters.policy.facts import SourceFacts
+from export_model.converters.trainers.pytorch.weights import TensorFile
+from export_model.signatures.errors import SourceError, UsageError
 
 
 class Saved(Struct, frozen=True):

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from signatures.errors import UsageError, whole
+from export_model.signatures.errors import UsageError, whole
 
 _MASK = np.uint64(0xFFFFFFFF)
 _HALF = np.uint64(32)

@@ -9,18 +9,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from exporter.acting.one_memory import with_one_memory
-from exporter.acting.policy import LoadedPolicy
-from signatures.batches import Run, in_batches
-from signatures.contract import POLICY
-from signatures.errors import BundleError, RuntimeUnavailableError, UsageError, naming
-from signatures.fields import printable
+from export_model.exporter.acting.one_memory import with_one_memory
+from export_model.exporter.acting.policy import LoadedPolicy
+from export_model.signatures.batches import Run, in_batches
+from export_model.signatures.contract import POLICY
+from export_model.signatures.errors import BundleError, RuntimeUnavailableError, UsageError, naming
+from export_model.signatures.fields import printable
 
 if TYPE_CHECKING:
-    from converters.compiler.options import CompileOptions
-    from converters.formats.bundle.bundle import Declared
-    from converters.formats.format import Format
-    from converters.formats.source import ReadOptions
+    from export_model.converters.compiler.options import CompileOptions
+    from export_model.converters.formats.bundle.bundle import Declared
+    from export_model.converters.formats.format import Format
+    from export_model.converters.formats.source import ReadOptions
 
 Array = np.ndarray
 #: What runs a policy in this process, the preferred first.
@@ -37,7 +37,7 @@ def load_policy(
         policy = load_policy("exported/3DBall")
         action = policy.decide(observation, deterministic=True).action
     """
-    from converters.compiler.options import CompileOptions
+    from export_model.converters.compiler.options import CompileOptions
 
     return load_as(Path(source), runtime, seed, CompileOptions(brain=brain))
 
@@ -46,8 +46,8 @@ def load_as(
     path: Path, runtime: str | None, seed: int, compiling: CompileOptions, read: ReadOptions | None = None
 ) -> LoadedPolicy:
     """Load the policy of a bundle or a source, read as the options say. A bundle's file is checked by its hash."""
-    from converters.compiler.options import CompileOptions
-    from converters.formats.source import ReadOptions
+    from export_model.converters.compiler.options import CompileOptions
+    from export_model.converters.formats.source import ReadOptions
 
     if runtime not in (None, *RUNTIMES):
         raise UsageError(f"runtime={runtime!r}: must be one of {', '.join(RUNTIMES)}")
@@ -62,13 +62,13 @@ def load_as(
 
 def _taken_by(runtime: str) -> Format:
     """The format that a runtime runs before all others."""
-    from converters.formats.registry import WRITTEN
+    from export_model.converters.formats.registry import WRITTEN
 
     return next(f for f in WRITTEN.values() if f.runtimes[:1] == (runtime,))
 
 
 def _of_bundle(folder: Path, runtime: str | None, seed: int) -> LoadedPolicy:
-    from converters.formats.bundle.bundle import Bundle
+    from export_model.converters.formats.bundle.bundle import Bundle
 
     found = Bundle.open(folder)
     named = {r: found.path(_taken_by(r)) for r in RUNTIMES if found.has(_taken_by(r))}
@@ -103,8 +103,8 @@ def _of_source(
     path: Path, runtime: str | None, seed: int, compiling: CompileOptions, read: ReadOptions | None
 ) -> LoadedPolicy:
     """A source's only policy, compiled and written in memory."""
-    from converters.formats.format import WriteOptions
-    from exporter.export.sources import read_source
+    from export_model.converters.formats.format import WriteOptions
+    from export_model.exporter.export.sources import read_source
 
     policies = read_source(path, read).policies(compiling)
     if len(policies) != 1:
@@ -151,22 +151,22 @@ def _fault(what: str, error: Exception) -> BundleError:
 
 
 def _in_numpy(model: bytes) -> tuple[Run, Declared]:
-    from converters.formats.bundle.bundle import declared_by
-    from converters.formats.bundle.embed import read_runnable
-    from converters.graph.run import run_graph
+    from export_model.converters.formats.bundle.bundle import declared_by
+    from export_model.converters.formats.bundle.embed import read_runnable
+    from export_model.converters.graph.run import run_graph
 
     graph = read_runnable(model)
     return lambda feeds, fetch: run_graph(graph, feeds, fetch), declared_by(graph)
 
 
 def _for_onnxruntime(path: Path, names: Sequence[str]) -> bytes:
-    from converters.formats.onnx.vetted import flat
+    from export_model.converters.formats.onnx.vetted import flat
 
     return flat(path, names)
 
 
 def _for_numpy(path: Path, names: Sequence[str]) -> bytes:
-    from converters.files.folders import scratch_folder
+    from export_model.converters.files.folders import scratch_folder
 
     vetted = _taken_by("numpy").vetted
     assert vetted is not None

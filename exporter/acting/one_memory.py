@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 from msgspec.structs import replace
 
-from signatures.batches import Arrays, Run
-from signatures.memories import SourcePart, join_memory, split_memory
-from signatures.roles import CANONICAL, Role
-from signatures.spec import PolicySignature, TensorSpec
+from export_model.signatures.batches import Arrays, Run
+from export_model.signatures.memories import SourcePart, join_memory, split_memory
+from export_model.signatures.roles import CANONICAL, Role
+from export_model.signatures.spec import PolicySignature, TensorSpec
 
 TAKEN, GIVEN = CANONICAL[Role.MEMORY_IN], CANONICAL[Role.MEMORY_OUT]
 

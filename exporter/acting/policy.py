@@ -9,12 +9,12 @@ import numpy.typing as npt
 from msgspec import Struct, field
 from msgspec.structs import replace
 
-from exporter.acting.generator import Generator, likeliest
-from signatures.batches import Run
-from signatures.errors import BundleError, UsageError, suggestion
-from signatures.ids import check_ids
-from signatures.roles import OBSERVATIONS, Role
-from signatures.spec import ActionHead, PolicySignature, TensorSpec
+from export_model.exporter.acting.generator import Generator, likeliest
+from export_model.signatures.batches import Run
+from export_model.signatures.errors import BundleError, UsageError, suggestion
+from export_model.signatures.ids import check_ids
+from export_model.signatures.roles import OBSERVATIONS, Role
+from export_model.signatures.spec import ActionHead, PolicySignature, TensorSpec
 
 Array = np.ndarray
 
@@ -74,8 +74,8 @@ class LoadedPolicy:
         return f"<LoadedPolicy {self.name!r} in {self.runtime}: {self.signature.flow}>"
 
     def _repr_html_(self) -> str:
-        from exporter.inspect.inspection import port_tables
-        from exporter.reports.markup import notebook
+        from export_model.exporter.inspect.inspection import port_tables
+        from export_model.exporter.reports.markup import notebook
 
         return notebook(f"{self.name}: a policy in {self.runtime}", *port_tables(self.signature))
 

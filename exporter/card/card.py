@@ -14,19 +14,19 @@ from pathlib import Path
 from msgspec import Struct, field
 from msgspec.structs import replace
 
-from converters.files.fetch import read_bytes
-from converters.formats.bundle import bundle
-from converters.formats.registry import FORMATS
-from converters.interfaces.text import loop_lines, tables
-from exporter.inspect.inspection import port_tables
-from exporter.reports.markdown import code, markdown_table, play_table, text
-from exporter.snippets.contract import read_bundle
-from exporter.snippets.registry import snippets
-from exporter.tables import size_text
-from exporter.verify.plays import PlayRecord, read_plays
-from signatures.contract import PARITY, POLICY, Contract, json_of
-from signatures.errors import BundleError
-from signatures.fields import Count, FieldError, Text, read
+from export_model.converters.files.fetch import read_bytes
+from export_model.converters.formats.bundle import bundle
+from export_model.converters.formats.registry import FORMATS
+from export_model.converters.interfaces.text import loop_lines, tables
+from export_model.exporter.inspect.inspection import port_tables
+from export_model.exporter.reports.markdown import code, markdown_table, play_table, text
+from export_model.exporter.snippets.contract import read_bundle
+from export_model.exporter.snippets.registry import snippets
+from export_model.exporter.tables import size_text
+from export_model.exporter.verify.plays import PlayRecord, read_plays
+from export_model.signatures.contract import PARITY, POLICY, Contract, json_of
+from export_model.signatures.errors import BundleError
+from export_model.signatures.fields import Count, FieldError, Text, read
 
 CARD = "README.md"
 #: Snippets that a card shows, the first of which a bundle has the files for.

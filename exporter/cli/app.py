@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from exporter.cli.group import Rooms, SourceGroup, help_all_option, show_version
+from export_model.exporter.cli.group import Rooms, SourceGroup, help_all_option, show_version
 
 _COMMANDS = (
     "card",
@@ -25,7 +25,7 @@ _COMMANDS = (
 
 @click.group(
     cls=SourceGroup,
-    commands=Rooms({name: f"exporter.cli.{name}" for name in _COMMANDS}),
+    commands=Rooms({name: f"export_model.exporter.cli.{name}" for name in _COMMANDS}),
     context_settings={"help_option_names": ["-h", "--help"]},
     help="Export trained policies to every runtime, and prove that all files agree.",
     params=[help_all_option()],

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import click
 
-from exporter.cli.group import PATH, command
-from exporter.cli.options import one_bundle
-from exporter.cli.terminal import say
+from export_model.exporter.cli.group import PATH, command
+from export_model.exporter.cli.options import one_bundle
+from export_model.exporter.cli.terminal import say
 
 
 @command(
@@ -22,7 +22,7 @@ def card_command(bundle: Path) -> None:
 
     The licence is left to whoever publishes it.
     """
-    from converters.files.fetch import path_text
-    from exporter.card.card import write_card
+    from export_model.converters.files.fetch import path_text
+    from export_model.exporter.card.card import write_card
 
     say(f"wrote {path_text(write_card(one_bundle(bundle, 'card')))}")

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from exporter.cli.console import Console, reporting
-from exporter.cli.group import PATH, command
-from exporter.cli.options import (
+from export_model.exporter.cli.console import Console, reporting
+from export_model.exporter.cli.group import PATH, command
+from export_model.exporter.cli.options import (
     JUDGING,
     as_given,
     comparing,
@@ -22,10 +22,10 @@ from exporter.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from converters.compiler.options import CompileOptions
-    from converters.formats.source import ReadOptions
-    from converters.policy.policy import Policy
-    from exporter.verify.options import VerifyOptions
+    from export_model.converters.compiler.options import CompileOptions
+    from export_model.converters.formats.source import ReadOptions
+    from export_model.converters.policy.policy import Policy
+    from export_model.exporter.verify.options import VerifyOptions
 
 
 @command(
@@ -61,9 +61,9 @@ def compare_command(
     """Compare files made by any tool with a reference: graphs, SavedModels, TensorFlow.js, ONNX, bundles."""
     from msgspec.structs import replace
 
-    from converters.files.fetch import path_text
-    from exporter.compare.comparison import CompareOptions, compare_artefacts
-    from exporter.reports.entry import Entry
+    from export_model.converters.files.fetch import path_text
+    from export_model.exporter.compare.comparison import CompareOptions, compare_artefacts
+    from export_model.exporter.reports.entry import Entry
 
     understood: list[Policy] = []
     with console.progress() as progress:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import click
 from click.shell_completion import get_completion_class
 
-from exporter.cli.group import PROGRAM, command
-from exporter.cli.terminal import say, say_lines
+from export_model.exporter.cli.group import PROGRAM, command
+from export_model.exporter.cli.terminal import say, say_lines
 
 _SHELLS = {
     "bash": 'add this to ~/.bashrc:  eval "$(export-model completion bash)"',

@@ -11,17 +11,17 @@ from typing import TYPE_CHECKING, Any
 import click
 from msgspec import Struct
 
-from exporter.cli.group import FILE
-from exporter.cli.terminal import Bar, Progress, say, say_json, say_lines, say_paragraph
-from signatures.errors import ExportModelError, UsageError
+from export_model.exporter.cli.group import FILE
+from export_model.exporter.cli.terminal import Bar, Progress, say, say_json, say_lines, say_paragraph
+from export_model.signatures.errors import ExportModelError, UsageError
 
 if TYPE_CHECKING:
-    from exporter.export.pipeline import ExportResult
-    from exporter.play.report import PlayReport
-    from exporter.reports.entry import Entry
-    from exporter.reports.write import Documents
-    from exporter.verify.report import ParityReport
-    from exporter.verify.tolerances import ToleranceRule
+    from export_model.exporter.export.pipeline import ExportResult
+    from export_model.exporter.play.report import PlayReport
+    from export_model.exporter.reports.entry import Entry
+    from export_model.exporter.reports.write import Documents
+    from export_model.exporter.verify.report import ParityReport
+    from export_model.exporter.verify.tolerances import ToleranceRule
 
 
 def _colour(reports: Sequence[ParityReport]) -> str:
@@ -49,7 +49,7 @@ class Console(Struct, frozen=True):
         if self.as_json and self._markdown_on_stdout:
             raise UsageError("--json and --markdown - both want stdout", fix="give --markdown a file")
         if self.wants_reports:
-            from exporter.reports.write import Destinations
+            from export_model.exporter.reports.write import Destinations
 
             Destinations(self.junit, self.markdown, self.html).prepare()
 
@@ -77,7 +77,7 @@ class Console(Struct, frozen=True):
         """What ``--tolerances`` says. Raises UsageError."""
         if self.tolerances is None:
             return ()
-        from exporter.verify.tolerance_file import read_tolerances
+        from export_model.exporter.verify.tolerance_file import read_tolerances
 
         return read_tolerances(self.tolerances)
 
@@ -109,15 +109,15 @@ class Console(Struct, frozen=True):
     def write_reports(self, entries: Callable[[], Sequence[Entry]], refused: Sequence[ExportModelError] = ()) -> None:
         """Write the reports that were asked for; ``entries`` is not called where there are none."""
         if self.wants_reports:
-            from exporter.reports.write import parity_documents
+            from export_model.exporter.reports.write import parity_documents
 
             self.write_documents(parity_documents(functools.cache(entries), refused))
 
     def write_documents(self, documents: Documents) -> None:
         """Write the reports that were asked for."""
         if self.wants_reports:
-            from exporter.reports.markdown import UNSEEN
-            from exporter.reports.write import Destinations
+            from export_model.exporter.reports.markdown import UNSEEN
+            from export_model.exporter.reports.write import Destinations
 
             echo = functools.partial(say_lines, keep=UNSEEN)
             Destinations(self.junit, self.markdown, self.html).write(documents, echo)
@@ -134,7 +134,7 @@ class Console(Struct, frozen=True):
         if result.report is not None:
             self._report(result.report)
             return
-        from exporter.tables import size_with_original, table
+        from export_model.exporter.tables import size_with_original, table
 
         rows = [[kind, size_with_original(kind, result.sizes, result.whole_sizes)] for kind in result.sizes]
         say_lines(table(("format", "size"), rows))
@@ -169,7 +169,13 @@ class Console(Struct, frozen=True):
             say_paragraph(note, "  note: ", "    ")
 
     def _report(self, report: ParityReport) -> None:
-        from exporter.reports.summary import comparison_table, failure_lines, foreign_words, not_run_line, parity_table
+        from export_model.exporter.reports.summary import (
+            comparison_table,
+            failure_lines,
+            foreign_words,
+            not_run_line,
+            parity_table,
+        )
 
         if not self.quiet and report.comparisons:
             for line in (comparison_table(report) if self.verbose else parity_table(report)).splitlines():
@@ -191,13 +197,13 @@ class Console(Struct, frozen=True):
         """What came of several policies, in one line; ``refused`` sources or bundles were."""
         if len(reports) + refused < 2 or self._silent or (self.quiet and all(r.passed is not False for r in reports)):
             return
-        from exporter.reports.summary import whole_summary
+        from export_model.exporter.reports.summary import whole_summary
 
         say_paragraph(whole_summary(reports, refused), colour="red" if refused else _colour(reports))
 
     def profiles(self) -> None:
         """Every profile with what it is for (``--for help``)."""
-        from converters.consumers.profiles import PROFILES
+        from export_model.converters.consumers.profiles import PROFILES
 
         if self.as_json:
             entries = [
@@ -246,15 +252,15 @@ class Console(Struct, frozen=True):
 
 def _can_be_dressed(sizes: Mapping[str, int]) -> bool:
     """Whether a format was written that Unity loads, under other names."""
-    from converters.formats.registry import WRITTEN
+    from export_model.converters.formats.registry import WRITTEN
 
     return any(WRITTEN[key].unity for key in sizes)
 
 
 def _verify_again(results: Sequence[ExportResult], sources: Sequence[Path]) -> list[str]:
     """The commands that verify bundles: with their source, where they have no file that is a reference."""
-    from converters.formats.registry import own_reference
-    from exporter.tables import command_text
+    from export_model.converters.formats.registry import own_reference
+    from export_model.exporter.tables import command_text
 
     folders: dict[tuple[object, ...], list[Path]] = {}
     for result in results:
@@ -268,8 +274,8 @@ def _verify_again(results: Sequence[ExportResult], sources: Sequence[Path]) -> l
 
 def _to_verify(results: Sequence[ExportResult], sources: Sequence[Path]) -> list[str]:
     """How to get a runtime, and what to verify then, where none ran."""
-    from exporter.reports.summary import to_verify
-    from exporter.tables import hint
+    from export_model.exporter.reports.summary import to_verify
+    from export_model.exporter.tables import hint
 
     open_ = [r for r in results if r.report is not None and r.report.passed is None]
     install = next(filter(None, (to_verify(r.report) for r in open_ if r.report is not None)), None)
@@ -281,8 +287,8 @@ def _to_verify(results: Sequence[ExportResult], sources: Sequence[Path]) -> list
 
 def _next_for(results: Sequence[ExportResult], profile: str, sources: Sequence[Path]) -> list[str]:
     """What to do with the files for a consumer, and where each policy's settings are told."""
-    from converters.consumers.profiles import profile as known
-    from exporter.tables import command_text
+    from export_model.converters.consumers.profiles import profile as known
+    from export_model.exporter.tables import command_text
 
     wanted = known(profile)
     *rest, last = (f"{_files(r)} of {r.folder}" for r in results)
@@ -300,22 +306,22 @@ def _files(result: ExportResult) -> str:
 
 def _next(results: Sequence[ExportResult], sources: Sequence[Path]) -> list[str]:
     """The command that is worth most now: for the policy that the page has a scene for, else the last."""
-    from exporter.tables import command_text, hint
+    from export_model.exporter.tables import command_text, hint
 
     last = results[-1]
     if len(results) > 1:
-        from exporter.serve.scenes import scene_of
+        from export_model.exporter.serve.scenes import scene_of
 
         last = next((r for r in results if scene_of(r.policy.name, r.policy.signature) is not None), last)
     if last.report is None:
         return [hint(command, "nothing was compared yet") for command in _verify_again(results, sources)]
     if told := _to_verify(results, sources):
         return told
-    from exporter.serve.site import NEEDED
+    from export_model.exporter.serve.site import NEEDED
 
     if NEEDED.keys() <= last.sizes.keys():
         return [hint(command_text("serve", last.folder), "see it act, in a browser")]
-    from exporter.snippets.registry import languages
+    from export_model.exporter.snippets.registry import languages
 
     if not (said := languages(last.sizes)):
         return [hint(command, "in a job, whenever it may have changed") for command in _verify_again(results, sources)]

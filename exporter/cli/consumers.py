@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import click
 
-from exporter.cli.terminal import say, say_json, say_lines
-from signatures.errors import UsageError
+from export_model.exporter.cli.terminal import say, say_json, say_lines
+from export_model.signatures.errors import UsageError
 
 
 @click.command("consumers", short_help="List Unity's importers and what each of them misreads.")
@@ -17,8 +17,8 @@ def consumers_command(importer: str | None, as_json: bool) -> None:
     With --json all tables: importers, releases of ML-Agents, profiles, readings by importer and construct with the
     exception and the evidence, and what the players make of inputs and outputs.
     """
-    from converters.consumers.published import consumer_tables
-    from exporter.tables import table
+    from export_model.converters.consumers.published import consumer_tables
+    from export_model.exporter.tables import table
 
     tables = consumer_tables()
     names = [i["name"] for i in tables["importers"]]

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import click
 
-from exporter.cli.export import export_command
-from exporter.cli.group import PATH, PROGRAM, command
-from exporter.cli.serve import serve_command
-from exporter.cli.terminal import say
+from export_model.exporter.cli.export import export_command
+from export_model.exporter.cli.group import PATH, PROGRAM, command
+from export_model.exporter.cli.serve import serve_command
+from export_model.exporter.cli.terminal import say
 
 
 @command(
@@ -36,8 +36,8 @@ def demo_command(out: Path | None, no_open: bool, files: bool) -> None:
 
 
 def _write_files(out: Path) -> None:
-    from exporter.demo.files import FILES, write_files
-    from exporter.tables import command_text
+    from export_model.exporter.demo.files import FILES, write_files
+    from export_model.exporter.tables import command_text
 
     write_files(out)
     width = max(map(len, FILES))
@@ -47,9 +47,9 @@ def _write_files(out: Path) -> None:
 
 
 def _demonstrate(out: Path, no_open: bool) -> None:
-    from converters.formats.bundle.bundle import writing
-    from exporter.demo import BALL
-    from signatures.errors import UsageError
+    from export_model.converters.formats.bundle.bundle import writing
+    from export_model.exporter.demo import BALL
+    from export_model.signatures.errors import UsageError
 
     source, report = out / BALL.name, out / "parity.html"
     if out.exists() and any(p.is_symlink() or (p.exists() and not p.is_file()) for p in (source, report)):

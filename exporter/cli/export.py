@@ -9,23 +9,23 @@ from typing import TYPE_CHECKING
 
 import click
 
-from exporter.cli.console import Console, reporting
-from exporter.cli.group import PATH, command
-from exporter.cli.options import RULES, as_given, coding, comparing, located, reading, understanding
-from exporter.cli.terminal import say_lines
+from export_model.exporter.cli.console import Console, reporting
+from export_model.exporter.cli.group import PATH, command
+from export_model.exporter.cli.options import RULES, as_given, coding, comparing, located, reading, understanding
+from export_model.exporter.cli.terminal import say_lines
 
 if TYPE_CHECKING:
-    from converters.compiler.options import CompileOptions
-    from converters.formats.source import ReadOptions
-    from converters.policy.policy import Policy
-    from exporter.export.options import ExportOptions
-    from exporter.export.pipeline import ExportResult
-    from exporter.play.report import PlayReport
-    from exporter.reports.entry import Entry
-    from exporter.reports.markup import Markup
-    from exporter.verify.options import VerifyOptions
-    from signatures.code import CodeOptions
-    from signatures.errors import ExportModelError
+    from export_model.converters.compiler.options import CompileOptions
+    from export_model.converters.formats.source import ReadOptions
+    from export_model.converters.policy.policy import Policy
+    from export_model.exporter.export.options import ExportOptions
+    from export_model.exporter.export.pipeline import ExportResult
+    from export_model.exporter.play.report import PlayReport
+    from export_model.exporter.reports.entry import Entry
+    from export_model.exporter.reports.markup import Markup
+    from export_model.exporter.verify.options import VerifyOptions
+    from export_model.signatures.code import CodeOptions
+    from export_model.signatures.errors import ExportModelError
 
 
 @command(
@@ -109,7 +109,7 @@ def export_command(
 
     This is the default command: 'export-model SOURCE' runs it.
     """
-    from exporter.export.options import ExportOptions, storage
+    from export_model.exporter.export.options import ExportOptions, storage
 
     if profile == "help":
         console.profiles()
@@ -135,7 +135,7 @@ def export_command(
     if env is not None:
         _check_playable(env, 2 if many else len(sources), runtimes, profile, bake)
     if many:
-        from exporter.cli.fleet import run_fleet
+        from export_model.exporter.cli.fleet import run_fleet
 
         run_fleet(sources, job, jobs=jobs, cluster=cluster, again=again, fail_fast=fail_fast, console=console)
     else:
@@ -144,8 +144,8 @@ def export_command(
 
 def _are_many(sources: Sequence[Path], out: Path) -> bool:
     """Whether a fleet exports them: folders, globs and lists, or bundles that are sent to an address."""
-    from converters.files.fetch import address_of
-    from exporter.fleet.sources import is_many
+    from export_model.converters.files.fetch import address_of
+    from export_model.exporter.fleet.sources import is_many
 
     return is_many(sources) or address_of(out) is not None
 
@@ -155,7 +155,7 @@ def _export_few(sources: Sequence[Path], job: ExportOptions, env: str | None, co
 
     def check_fit(policies: Sequence[Policy]) -> None:
         if env is not None:
-            from exporter.play.named import world_maker
+            from export_model.exporter.play.named import world_maker
 
             for policy in policies:
                 world_maker(env, sources[0])(policy.signature)
@@ -184,7 +184,7 @@ def _export_all(
     sources: Sequence[Path], job: ExportOptions, console: Console, understood: Callable[[Sequence[Policy]], object]
 ) -> tuple[list[ExportResult], list[ExportModelError]]:
     """Export sources one after the other, and print what came of each; return the results and what was refused."""
-    from exporter.export.pipeline import export
+    from export_model.exporter.export.pipeline import export
 
     results: list[ExportResult] = []
     refused: list[ExportModelError] = []
@@ -205,8 +205,8 @@ def _export_all(
 
 def _check_playable(env: str, sources: int, runtimes: str, profile: str | None, bake: str | None) -> None:
     """Raise UsageError where what is exported cannot play, before anything takes long."""
-    from exporter.play.named import world_maker
-    from signatures.errors import UsageError
+    from export_model.exporter.play.named import world_maker
+    from export_model.signatures.errors import UsageError
 
     if sources != 1:
         raise UsageError("--env goes with a single source", fix="export-model play BUNDLE --env plays one bundle")
@@ -229,9 +229,9 @@ def _play(
     env: str, source: Path, results: Sequence[ExportResult], job: ExportOptions, console: Console
 ) -> list[PlayReport]:
     """Play with each bundle whose formats agree; the source is the reference of the only one."""
-    from exporter.play.play import play_policy
-    from exporter.play.record import keep_record
-    from exporter.verify.options import VerifyOptions
+    from export_model.exporter.play.play import play_policy
+    from export_model.exporter.play.record import keep_record
+    from export_model.exporter.verify.options import VerifyOptions
 
     judging = VerifyOptions(runtimes=job.verify, rules=job.parity.rules)
     played = []
@@ -268,7 +268,7 @@ def _with_played(result: ExportResult, played: Sequence[PlayReport]) -> ExportRe
 def _entries(results: Sequence[ExportResult], steps: int, played: Sequence[PlayReport]) -> list[Entry]:
     from msgspec.structs import replace
 
-    from exporter.reports.entry import of_result
+    from export_model.exporter.reports.entry import of_result
 
     words, found = as_given(RULES), []
     for result in results:
@@ -283,6 +283,6 @@ def _pictures(played: Iterable[PlayReport]) -> tuple[Markup, ...]:
     found = list(played)
     if not found:
         return ()
-    from exporter.play.documents import returns_section
+    from export_model.exporter.play.documents import returns_section
 
     return tuple(returns_section(report) for report in found)

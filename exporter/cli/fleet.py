@@ -10,19 +10,19 @@ from typing import TYPE_CHECKING, Any
 
 from msgspec.structs import replace
 
-from converters.files.fetch import path_text
-from exporter.cli.console import Console
-from exporter.cli.options import RULES, as_given
-from exporter.cli.terminal import say_lines
-from exporter.fleet.fleet import export_fleet
-from exporter.fleet.sources import paths_text, sources_in
-from exporter.fleet.worker import Outcome, Wanted
-from exporter.tables import count_text
-from signatures.errors import ExportModelError, UsageError
+from export_model.converters.files.fetch import path_text
+from export_model.exporter.cli.console import Console
+from export_model.exporter.cli.options import RULES, as_given
+from export_model.exporter.cli.terminal import say_lines
+from export_model.exporter.fleet.fleet import export_fleet
+from export_model.exporter.fleet.sources import paths_text, sources_in
+from export_model.exporter.fleet.worker import Outcome, Wanted
+from export_model.exporter.tables import count_text
+from export_model.signatures.errors import ExportModelError, UsageError
 
 if TYPE_CHECKING:
-    from exporter.export.options import ExportOptions
-    from exporter.reports.entry import Entry
+    from export_model.exporter.export.options import ExportOptions
+    from export_model.exporter.reports.entry import Entry
 
 #: Sources whose failure is told; of more, the number.
 _MOST_SHOWN = 50

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from exporter import __version__
-from exporter.cli.terminal import say, say_lines
-from signatures.errors import UsageError
+from export_model.exporter import __version__
+from export_model.exporter.cli.terminal import say, say_lines
+from export_model.signatures.errors import UsageError
 
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
@@ -70,7 +70,7 @@ GROUPS = {
 
 
 #: Where a context keeps that all options are to be shown.
-_ALL = "exporter.cli.help_all"
+_ALL = "export_model.exporter.cli.help_all"
 
 
 class Command(click.Command):
@@ -228,7 +228,7 @@ def show_version(ctx: click.Context, parameter: click.Parameter, wanted: bool) -
     """``--version``: this program's, and the runtimes that were found."""
     if not wanted or ctx.resilient_parsing:
         return
-    from converters.runtimes.registry import available_runtimes
+    from export_model.converters.runtimes.registry import available_runtimes
 
     say(f"{PROGRAM}, version {__version__}")
     here = [f"{i.name} {i.version or ''}".strip() for i in available_runtimes() if i.installed]

@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from exporter.cli.export import export_command
-from exporter.cli.group import FILE, PATH, command
-from exporter.cli.options import as_given, reading, understanding
-from exporter.cli.terminal import say, say_json, say_lines
-from signatures.errors import ExportModelError, UsageError
+from export_model.exporter.cli.export import export_command
+from export_model.exporter.cli.group import FILE, PATH, command
+from export_model.exporter.cli.options import as_given, reading, understanding
+from export_model.exporter.cli.terminal import say, say_json, say_lines
+from export_model.signatures.errors import ExportModelError, UsageError
 
 if TYPE_CHECKING:
-    from converters.compiler.options import CompileOptions
-    from converters.formats.source import ReadOptions
+    from export_model.converters.compiler.options import CompileOptions
+    from export_model.converters.formats.source import ReadOptions
 
 
 #: What only our readers are told.
@@ -70,9 +70,9 @@ def inspect_command(
 
     With --unity, what ML-Agents in Unity says about it instead; the status is 1 if a release does not accept it.
     """
-    from converters.compiler.options import CompileOptions
-    from converters.files.fetch import path_text
-    from exporter.remote.fetching import nearby
+    from export_model.converters.compiler.options import CompileOptions
+    from export_model.converters.files.fetch import path_text
+    from export_model.exporter.remote.fetching import nearby
 
     if len(sources) > 1:
         _check_alone(logdir, svg)
@@ -130,8 +130,8 @@ def _check_alone(logdir: Path | None, svg: Path | None) -> None:
 
 
 def _say_next(sources: Sequence[Path]) -> None:
-    from converters.files.fetch import path_text
-    from exporter.tables import command_text
+    from export_model.converters.files.fetch import path_text
+    from export_model.exporter.tables import command_text
 
     both = as_given({p.name for p in export_command.params if p.name is not None} - {"as_json"})
     say(f"next: {command_text(*map(path_text, sources), *both, '-o', 'exported')}")
@@ -157,13 +157,13 @@ def _inspect_source(
 
     For a program (``as_json``) nothing is printed but errors.
     """
-    from exporter.inspect.inspection import inspect_source, inspection_text
+    from export_model.exporter.inspect.inspection import inspect_source, inspection_text
 
     refused: list[ExportModelError] = []
     found = inspect_source(source, compiling, read, refused, why=why)
     written: list[Path] = []
     if logdir is not None or svg is not None:
-        from exporter.inspect.pictures import write_pictures
+        from export_model.exporter.inspect.pictures import write_pictures
 
         written = write_pictures(found, logdir, svg)
     if not as_json:
@@ -183,15 +183,15 @@ def _unity(
     as_json: bool,
     svg: Path | None,
 ) -> tuple[int, dict[str, Any]]:
-    from exporter.inspect.unity import all_accept, check_for_unity, unity_report, unity_text
+    from export_model.exporter.inspect.unity import all_accept, check_for_unity, unity_report, unity_text
 
     sensors, actions, parameters = agent
     verdicts = check_for_unity(source, releases, sensors or "", actions or "", parameters)
     if svg is not None:
         if len(verdicts) != 1:
             raise UsageError("--svg draws one verdict", fix="name one release and one file")
-        from converters.formats.bundle.bundle import writing
-        from exporter.inspect.behavior_parameters import behavior_parameters
+        from export_model.converters.formats.bundle.bundle import writing
+        from export_model.exporter.inspect.behavior_parameters import behavior_parameters
 
         with writing(svg):
             svg.write_text(behavior_parameters(verdicts[0]), encoding="utf-8")

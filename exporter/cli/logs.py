@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from exporter.cli.console import Console
-from exporter.cli.options import as_given
-from exporter.cli.terminal import say_paragraph
-from signatures.errors import UsageError
+from export_model.exporter.cli.console import Console
+from export_model.exporter.cli.options import as_given
+from export_model.exporter.cli.terminal import say_paragraph
+from export_model.signatures.errors import UsageError
 
 if TYPE_CHECKING:
-    from exporter.verify.options import VerifyOptions
+    from export_model.exporter.verify.options import VerifyOptions
 
 
 #: Parameters of ``verify`` that nothing of a log depends on.
@@ -27,10 +27,10 @@ _UNHEARD = frozenset(
 
 def check_log_of(bundles: Sequence[Path], log: Path, options: VerifyOptions, console: Console) -> None:
     """Compute every step of ``log`` again and say what explains the steps that differ; ends with status 1 for those."""
-    from exporter.acting.loading import load_policy
-    from exporter.logs.check import check_log
-    from exporter.logs.judging import LOG_TOLERANCE
-    from exporter.verify.tolerances import Tolerance
+    from export_model.exporter.acting.loading import load_policy
+    from export_model.exporter.logs.check import check_log
+    from export_model.exporter.logs.judging import LOG_TOLERANCE
+    from export_model.exporter.verify.tolerances import Tolerance
 
     if len(bundles) != 1:
         raise UsageError(f"--log goes with one policy, and {len(bundles)} were given", fix="verify them one by one")
@@ -47,12 +47,12 @@ def check_log_of(bundles: Sequence[Path], log: Path, options: VerifyOptions, con
         report = check_log(load_policy(bundles[0]), log, tolerance)
         progress.clear()
     if console.html is not None:
-        from exporter.logs.page import log_page
+        from export_model.exporter.logs.page import log_page
 
         console.html.write_text(log_page(report), encoding="utf-8")
     console.json(report.to_dict())
     if not console.as_json and not (console.quiet and report.fits):
-        from exporter.logs.wording import report_lines, sentence
+        from export_model.exporter.logs.wording import report_lines, sentence
 
         for line in report_lines(report):
             indent = line[: len(line) - len(line.lstrip())]

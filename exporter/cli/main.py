@@ -79,7 +79,7 @@ def _clean_up() -> None:
 
 
 def _folders() -> Any:
-    return sys.modules.get("converters.files.folders")
+    return sys.modules.get("export_model.converters.files.folders")
 
 
 def _use_one_thread() -> None:
@@ -93,8 +93,8 @@ def _use_one_thread() -> None:
 
 def _run(args: list[str]) -> None:
     _use_one_thread()
-    from exporter.cli.streams import whole_streams
-    from signatures.cycles import raise_gc_threshold
+    from export_model.exporter.cli.streams import whole_streams
+    from export_model.signatures.cycles import raise_gc_threshold
 
     raise_gc_threshold()  # before the imports, which are a good part of an export
     with whole_streams():
@@ -107,9 +107,9 @@ def _command(args: list[str]) -> None:
 
     import click
 
-    from exporter.cli.app import app
-    from exporter.cli.terminal import say, say_json, say_lines
-    from signatures.errors import ExportModelError, UsageError
+    from export_model.exporter.cli.app import app
+    from export_model.exporter.cli.terminal import say, say_json, say_lines
+    from export_model.signatures.errors import ExportModelError, UsageError
 
     wants_json = "--json" in args
     try:

@@ -11,9 +11,9 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from exporter.cli.console import Console
-from exporter.cli.group import FILE
-from signatures.errors import UsageError, suggestion
+from export_model.exporter.cli.console import Console
+from export_model.exporter.cli.group import FILE
+from export_model.signatures.errors import UsageError, suggestion
 
 #: A value that each option of pairs takes.
 _EXAMPLES = {
@@ -37,8 +37,8 @@ def pairs(values: Sequence[str], flag: str) -> dict[str, str]:
 
 def one_bundle(place: Path, command: str) -> Path:
     """The bundle at ``place``, or the only one in that folder; else the place itself. Raises UsageError for several."""
-    from converters.formats.bundle.bundle import bundles_in
-    from exporter.tables import command_text
+    from export_model.converters.formats.bundle.bundle import bundles_in
+    from export_model.exporter.tables import command_text
 
     found = bundles_in(place)
     if len(found) > 1:
@@ -54,7 +54,7 @@ def as_given(names: Container[str]) -> list[str]:
 
     What ``reading_candidates`` adds counts as what it repeats.
     """
-    from converters.files.fetch import path_text
+    from export_model.converters.files.fetch import path_text
 
     context = click.get_current_context()
     words: list[str] = []
@@ -158,7 +158,7 @@ def reading(*names: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(command)
         def parse_and_call(*args: Any, **rest: Any) -> Any:
-            from converters.formats.source import ReadOptions
+            from export_model.converters.formats.source import ReadOptions
 
             told = {name: rest.pop(name) for name in names or _READING}
             if "sensors" in told:
@@ -200,7 +200,7 @@ def understanding(command: Callable[..., Any]) -> Callable[..., Any]:
     def parse_and_call(
         *args: Any, brain: str | None, inputs: Sequence[str], outputs: Sequence[str], values: Sequence[str], **rest: Any
     ) -> Any:
-        from exporter.options import ReadOptions, WriteOptions, compile_options
+        from export_model.exporter.options import ReadOptions, WriteOptions, compile_options
 
         if _WITHOUT_NORMALISER in values:
             if rest.get("normaliser") is not None:
@@ -261,7 +261,7 @@ def coding(command: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(command)
     def parse_and_call(*args: Any, math: str, weights: str, outputs_of: str, guard: float | None, **rest: Any) -> Any:
-        from signatures.code import code_options
+        from export_model.signatures.code import code_options
 
         return command(*args, code=code_options(math, weights, outputs_of, guard), **rest)
 
@@ -279,7 +279,7 @@ def _required_formats(given: str | None, *, unverified: str | None) -> tuple[str
     """Return the formats of ``--require``. Raises UsageError."""
     if given is None:
         return ()
-    from converters.formats.registry import WRITTEN
+    from export_model.converters.formats.registry import WRITTEN
 
     wanted = tuple(dict.fromkeys(word.strip() for word in given.split(",") if word.strip()))
     wrong = next((word for word in wanted if word != "all" and word not in WRITTEN), None)
@@ -312,9 +312,9 @@ def comparing(command: Callable[..., Any]) -> Callable[..., Any]:
         required: str | None,
         **rest: Any,
     ) -> Any:
-        from exporter.verify.checks.size import parse_budget
-        from exporter.verify.options import VerifyOptions
-        from exporter.verify.tolerances import Tolerance
+        from export_model.exporter.verify.checks.size import parse_budget
+        from export_model.exporter.verify.options import VerifyOptions
+        from export_model.exporter.verify.tolerances import Tolerance
 
         tolerance = Tolerance(atol, rtol)
         unverified = "--allow-unverified" if rest.get("allow_unverified") else None

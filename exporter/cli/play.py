@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 
 import click
 
-from exporter.cli.console import Console, reporting
-from exporter.cli.group import PATH, command
-from exporter.cli.options import located, pairs, reading, understanding
+from export_model.exporter.cli.console import Console, reporting
+from export_model.exporter.cli.group import PATH, command
+from export_model.exporter.cli.options import located, pairs, reading, understanding
 
 if TYPE_CHECKING:
-    from converters.compiler.options import CompileOptions
-    from converters.formats.source import ReadOptions
+    from export_model.converters.compiler.options import CompileOptions
+    from export_model.converters.formats.source import ReadOptions
 
 
 @command(
@@ -75,9 +75,9 @@ def play_command(
     Each is fed the states that the reference met, step by step; then each plays whole episodes from the same seeds.
     Without a candidate, the formats of the bundle play, or those that an export of the source would write.
     """
-    from exporter.play.options import PlayOptions
-    from exporter.play.play import play_policy
-    from exporter.verify.options import VerifyOptions
+    from export_model.exporter.play.options import PlayOptions
+    from export_model.exporter.play.play import play_policy
+    from export_model.exporter.verify.options import VerifyOptions
 
     options = PlayOptions(episodes, seed, margin, likeliest, most)
     with console.progress() as progress:
@@ -97,7 +97,7 @@ def play_command(
     console.report_play(report)
     console.json(report.to_dict())
     if console.wants_reports:
-        from exporter.play.documents import play_documents
+        from export_model.exporter.play.documents import play_documents
 
         console.write_documents(play_documents(report))
     if report.passed is False or (strict and report.passed is None):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import click
 
-from exporter.cli.terminal import say, say_json, say_lines, say_paragraph
-from signatures.errors import UsageError
+from export_model.exporter.cli.terminal import say, say_json, say_lines, say_paragraph
+from export_model.signatures.errors import UsageError
 
 #: Part of the confinement of a runtime's process → what it means.
 _SAID = {
@@ -24,9 +24,9 @@ def runtimes_command(ctx: click.Context, as_json: bool) -> None:
     """List the installed runtimes with their versions, and how to install the others."""
     if ctx.invoked_subcommand is not None:
         return
-    from converters.files.children.confinement import in_force
-    from converters.runtimes.registry import available_runtimes
-    from exporter.tables import table
+    from export_model.converters.files.children.confinement import in_force
+    from export_model.converters.runtimes.registry import available_runtimes
+    from export_model.exporter.tables import table
 
     found = available_runtimes()
     kept = in_force()
@@ -50,7 +50,7 @@ def runtimes_command(ctx: click.Context, as_json: bool) -> None:
 @click.argument("name")
 def install_command(name: str) -> None:
     """Install a runtime into the user's cache folder; "tfjs" and "tf1" stand for all whose names begin so."""
-    from converters.runtimes.registry import RUNTIMES
+    from export_model.converters.runtimes.registry import RUNTIMES
 
     chosen = [r for r in RUNTIMES if r.name == name]
     chosen = chosen or [r for r in RUNTIMES if r.name.startswith((f"{name}-", f"{name}."))]

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import click
 
-from exporter.cli.group import PATH, command
-from exporter.cli.options import one_bundle
-from exporter.cli.terminal import say
-from signatures.errors import UsageError
+from export_model.exporter.cli.group import PATH, command
+from export_model.exporter.cli.options import one_bundle
+from export_model.exporter.cli.terminal import say
+from export_model.signatures.errors import UsageError
 
 _SCENES = ("auto", "ball3d", "crawler2d", "gridworld", "hallway", "tennis", "none")
 
@@ -38,8 +38,8 @@ _SCENES = ("auto", "ball3d", "crawler2d", "gridworld", "hallway", "tennis", "non
 )
 def serve_command(bundle: Path, host: str, port: int, opens: bool, out: Path | None, scene: str) -> None:
     """A page where the policy acts in your browser: its environment if it is a known one, else a panel of sliders."""
-    from converters.formats.bundle.bundle import bundles_in
-    from exporter.serve.site import assemble, assemble_one_file, write_file, write_site
+    from export_model.converters.formats.bundle.bundle import bundles_in
+    from export_model.exporter.serve.site import assemble, assemble_one_file, write_file, write_site
 
     if out is not None and opens:
         raise UsageError("--out and --open contradict each other", fix="open what is written, or leave --out out")
@@ -66,7 +66,7 @@ def serve_command(bundle: Path, host: str, port: int, opens: bool, out: Path | N
 
 def _serve(site: Mapping[str, bytes], host: str, port: int, opens: bool) -> None:
     """Serve until Ctrl-C."""
-    from exporter.serve.server import interrupts, listening
+    from export_model.exporter.serve.server import interrupts, listening
 
     with listening(site, host, port) as server, interrupts() as told:
         say(f"{server.url}  (Ctrl-C ends)")
@@ -80,9 +80,9 @@ def _serve(site: Mapping[str, bytes], host: str, port: int, opens: bool) -> None
 
 def _gallery(folders: Sequence[Path], out: Path | None, scene: str, host: str, port: int, opens: bool) -> None:
     """The gallery of a folder of bundles, served or written."""
-    from exporter.serve.gallery import assemble_gallery
-    from exporter.serve.site import write_site
-    from exporter.tables import command_text, count_text
+    from export_model.exporter.serve.gallery import assemble_gallery
+    from export_model.exporter.serve.site import write_site
+    from export_model.exporter.tables import command_text, count_text
 
     if scene != "auto":
         raise UsageError(f"--scene {scene} goes with a single bundle", fix=command_text("serve", folders[0]))
@@ -107,17 +107,17 @@ def _gallery(folders: Sequence[Path], out: Path | None, scene: str, host: str, p
 @contextmanager
 def _bundle_of(place: Path) -> Iterator[Path]:
     """The bundle at ``place``; a source is exported into a folder that lasts as long as the context."""
-    from signatures.contract import POLICY  # it loads numpy
+    from export_model.signatures.contract import POLICY  # it loads numpy
 
     found = one_bundle(place, "serve")
     if (found / POLICY).is_file() or not place.exists():
         yield found
         return
-    from converters.files.folders import scratch_folder
-    from exporter.export.options import ExportOptions
-    from exporter.export.pipeline import export
-    from exporter.serve.site import NEEDED
-    from exporter.tables import command_text
+    from export_model.converters.files.folders import scratch_folder
+    from export_model.exporter.export.options import ExportOptions
+    from export_model.exporter.export.pipeline import export
+    from export_model.exporter.serve.site import NEEDED
+    from export_model.exporter.tables import command_text
 
     with scratch_folder() as folder:
         results = list(export([place], ExportOptions(folder, tuple(NEEDED), verify="none")))

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import click
 
-from exporter import __version__
-from exporter.cli.group import PROGRAM, Command, command
-from exporter.cli.terminal import say_lines
-from signatures.errors import ExportModelError, ParityError, RuntimeUnavailableError
+from export_model.exporter import __version__
+from export_model.exporter.cli.group import PROGRAM, Command, command
+from export_model.exporter.cli.terminal import say_lines
+from export_model.signatures.errors import ExportModelError, ParityError, RuntimeUnavailableError
 
 #: What is typed → what it is for; tests/exporter/test_skill.py runs them in order, on the files of ``demo --files``.
 RECIPES = (

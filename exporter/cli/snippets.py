@@ -6,10 +6,10 @@ from pathlib import Path
 
 import click
 
-from exporter.cli.group import PATH, command
-from exporter.cli.options import one_bundle
-from exporter.cli.terminal import say, say_json, say_lines
-from signatures.errors import UsageError
+from export_model.exporter.cli.group import PATH, command
+from export_model.exporter.cli.options import one_bundle
+from export_model.exporter.cli.terminal import say, say_json, say_lines
+from export_model.signatures.errors import UsageError
 
 
 @command(
@@ -23,9 +23,9 @@ from signatures.errors import UsageError
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 def snippets_command(bundle: Path | None, target: str | None, as_json: bool) -> None:
     """Code to copy: how to call this policy from Python, TF Serving, JavaScript, C# and Unity."""
-    from exporter.snippets.contract import read_bundle
-    from exporter.snippets.registry import TARGETS, snippets
-    from exporter.tables import table
+    from export_model.exporter.snippets.contract import read_bundle
+    from export_model.exporter.snippets.registry import TARGETS, snippets
+    from export_model.exporter.tables import table
 
     if target == "help":
         rows = [[t.name, t.title, t.formats_text] for t in TARGETS]

@@ -19,7 +19,7 @@ from typing import Any
 
 import click
 
-from signatures.fields import printable
+from export_model.signatures.fields import printable
 
 _ERASE = "\r\x1b[2K"
 #: What the logs of a CI obey: a line that begins with "::" (GitHub), "##[", "##vso[" (Azure), "##teamcity[".
@@ -40,7 +40,7 @@ def say_lines(text: str, *, colour: str | None = None, keep: str = "", err: bool
 
 def say_paragraph(text: str, first: str = "", rest: str = "  ", *, colour: str | None = None) -> None:
     """Print one text after ``first``, wrapped with ``rest`` before the lines that follow."""
-    from exporter.tables import paragraph
+    from export_model.exporter.tables import paragraph
 
     say_lines(paragraph(text, first, rest), colour=colour)
 

@@ -11,17 +11,17 @@ from typing import TYPE_CHECKING
 
 import click
 
-from exporter.cli.console import Console, reporting
-from exporter.cli.group import FILE, PATH, command
-from exporter.cli.options import JUDGING, as_given, comparing, located, trusting
-from exporter.cli.terminal import say_lines
-from signatures.errors import ExportModelError, RuntimeUnavailableError, UsageError
-from signatures.fields import printable
+from export_model.exporter.cli.console import Console, reporting
+from export_model.exporter.cli.group import FILE, PATH, command
+from export_model.exporter.cli.options import JUDGING, as_given, comparing, located, trusting
+from export_model.exporter.cli.terminal import say_lines
+from export_model.signatures.errors import ExportModelError, RuntimeUnavailableError, UsageError
+from export_model.signatures.fields import printable
 
 if TYPE_CHECKING:
-    from exporter.reports.entry import Entry
-    from exporter.verify.options import VerifyOptions
-    from exporter.verify.report import ParityReport
+    from export_model.exporter.reports.entry import Entry
+    from export_model.exporter.verify.options import VerifyOptions
+    from export_model.exporter.verify.report import ParityReport
 
 
 @command(
@@ -68,11 +68,11 @@ def verify_command(
 
     Given a folder of bundles, it verifies all of them.
     """
-    from exporter.export.again import verify_folder
-    from exporter.remote.fetching import nearby
+    from export_model.exporter.export.again import verify_folder
+    from export_model.exporter.remote.fetching import nearby
 
     if log is not None:
-        from exporter.cli.logs import check_log_of
+        from export_model.exporter.cli.logs import check_log_of
 
         check_log_of(bundles, log, options, console)
         return
@@ -109,7 +109,7 @@ def _verify_all(
     places: Sequence[tuple[Path, Path | None]], verifying: Callable[..., ParityReport], console: Console
 ) -> tuple[list[tuple[tuple[Path, Path | None], ParityReport]], list[ExportModelError]]:
     """Verify bundles one after the other, and print what came of each; return the reports and what was refused."""
-    from exporter.export.pipeline import numbered_progress
+    from export_model.exporter.export.pipeline import numbered_progress
 
     verified, refused = [], list[ExportModelError]()
     with console.progress() as progress:
@@ -133,8 +133,8 @@ def _verify_all(
 
 def _bundles_at(given: Path, place: Path, *, quiet: bool) -> list[tuple[Path, Path | None]]:
     """Return each bundle of a folder, or the folder, with the address it is from; say what else lies there."""
-    from converters.files.fetch import path_text
-    from converters.formats.bundle.bundle import bundles_in, other_folders_in
+    from export_model.converters.files.fetch import path_text
+    from export_model.converters.formats.bundle.bundle import bundles_in, other_folders_in
 
     whole, (broken, others) = bundles_in(place), other_folders_in(place)
     if (whole or broken) and others and not quiet:
@@ -146,7 +146,7 @@ def _bundles_at(given: Path, place: Path, *, quiet: bool) -> list[tuple[Path, Pa
 def _bundle_entries(
     reports: Sequence[ParityReport], places: Sequence[tuple[Path, Path | None]], steps: int
 ) -> list[Entry]:
-    from exporter.reports.entry import of_bundle
+    from export_model.exporter.reports.entry import of_bundle
 
     words = as_given(JUDGING)
     return [of_bundle(report, *place, steps, words) for report, place in zip(reports, places, strict=True)]

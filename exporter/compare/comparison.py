@@ -18,25 +18,25 @@ import numpy as np
 from msgspec import Struct, field
 from msgspec.structs import replace
 
-from converters.compiler.options import CompileOptions
-from converters.compiler.passes.weights import Storage
-from converters.files.children.process import LoadedModel, RunFailedError
-from converters.files.folders import scratch_folder, size_of
-from converters.formats.source import OriginalRun, ReadOptions
-from converters.interfaces.differences import interface_differences
-from converters.policy.policy import Policy
-from converters.runtimes.pool import RuntimePool, chosen_runtimes, unverified_error
-from exporter.compare.explaining import Explaining
-from exporter.compare.matching import AnyCandidate, Candidate, match_candidates
-from exporter.compare.reading import ReadCandidate, read_participants
-from exporter.compare.weights import compare_rounded, merge_reports, rounded_to
-from exporter.export.sources import read_source
-from exporter.remote.fetching import nearby
-from exporter.verify.checks.size import check_budget
-from exporter.verify.difference import compare
-from exporter.verify.findings import Finding, stated_finding
-from exporter.verify.options import VerifyOptions
-from exporter.verify.participants import (
+from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.compiler.passes.weights import Storage
+from export_model.converters.files.children.process import LoadedModel, RunFailedError
+from export_model.converters.files.folders import scratch_folder, size_of
+from export_model.converters.formats.source import OriginalRun, ReadOptions
+from export_model.converters.interfaces.differences import interface_differences
+from export_model.converters.policy.policy import Policy
+from export_model.converters.runtimes.pool import RuntimePool, chosen_runtimes, unverified_error
+from export_model.exporter.compare.explaining import Explaining
+from export_model.exporter.compare.matching import AnyCandidate, Candidate, match_candidates
+from export_model.exporter.compare.reading import ReadCandidate, read_participants
+from export_model.exporter.compare.weights import compare_rounded, merge_reports, rounded_to
+from export_model.exporter.export.sources import read_source
+from export_model.exporter.remote.fetching import nearby
+from export_model.exporter.verify.checks.size import check_budget
+from export_model.exporter.verify.difference import compare
+from export_model.exporter.verify.findings import Finding, stated_finding
+from export_model.exporter.verify.options import VerifyOptions
+from export_model.exporter.verify.participants import (
     Failure,
     Feeds,
     Participant,
@@ -47,13 +47,13 @@ from exporter.verify.participants import (
     policy_under_test,
     write_reference,
 )
-from exporter.verify.reference import random_outputs
-from exporter.verify.report import ParityReport
-from exporter.verify.session import Session
-from exporter.verify.tolerances import Tolerance, check_rules
-from exporter.verify.verification import CHECKS, Judge, verify
-from signatures.errors import UsageError, naming
-from signatures.sampling import draw_cases
+from export_model.exporter.verify.reference import random_outputs
+from export_model.exporter.verify.report import ParityReport
+from export_model.exporter.verify.session import Session
+from export_model.exporter.verify.tolerances import Tolerance, check_rules
+from export_model.exporter.verify.verification import CHECKS, Judge, verify
+from export_model.signatures.errors import UsageError, naming
+from export_model.signatures.sampling import draw_cases
 
 _LOG = logging.getLogger(__name__)
 Progress = Callable[[str], None]

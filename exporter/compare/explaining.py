@@ -10,18 +10,18 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from exporter.logs.judging import LOG_TOLERANCE, targets_of
-from exporter.logs.recording import NONE, Array, Recording
-from exporter.logs.replay import Replay
-from exporter.logs.search import Explanation, explain
-from exporter.logs.trials import Trials
-from exporter.verify.findings import Finding
-from exporter.verify.participants import Feeds, Participant, Run
-from exporter.verify.trial import Trial
-from exporter.verify.work import products
-from signatures.roles import Role
-from signatures.sampling import draw_rollout
-from signatures.spec import PolicySignature
+from export_model.exporter.logs.judging import LOG_TOLERANCE, targets_of
+from export_model.exporter.logs.recording import NONE, Array, Recording
+from export_model.exporter.logs.replay import Replay
+from export_model.exporter.logs.search import Explanation, explain
+from export_model.exporter.logs.trials import Trials
+from export_model.exporter.verify.findings import Finding
+from export_model.exporter.verify.participants import Feeds, Participant, Run
+from export_model.exporter.verify.trial import Trial
+from export_model.exporter.verify.work import products
+from export_model.signatures.roles import Role
+from export_model.signatures.sampling import draw_rollout
+from export_model.signatures.spec import PolicySignature
 
 #: Products that a row may cost: thousands of causes are tried on dozens of rows.
 _MOST_PRODUCTS = 3_000_000

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from converters.formats.format import Port
-from signatures.spec import TensorSpec
+from export_model.converters.formats.format import Port
+from export_model.signatures.spec import TensorSpec
 
 
 def misfit(spec: TensorSpec, port: Port) -> str:

@@ -10,26 +10,26 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from converters.compiler.options import CompileOptions
-from converters.compiler.passes.weights import Storage
-from converters.files.fetch import Fetched
-from converters.formats.bundle.bundle import Bundle
-from converters.formats.format import Format, Port, Ports
-from converters.formats.read import ports_of
-from converters.formats.recognise import recognise_path
-from converters.formats.source import ReadOptions
-from converters.policy.policy import Policy
-from exporter.compare.fit import misfit
-from exporter.compare.reading import ReadCandidate, read_candidate
-from exporter.compare.weights import rounded_to
-from exporter.verify.participants import (
+from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.compiler.passes.weights import Storage
+from export_model.converters.files.fetch import Fetched
+from export_model.converters.formats.bundle.bundle import Bundle
+from export_model.converters.formats.format import Format, Port, Ports
+from export_model.converters.formats.read import ports_of
+from export_model.converters.formats.recognise import recognise_path
+from export_model.converters.formats.source import ReadOptions
+from export_model.converters.policy.policy import Policy
+from export_model.exporter.compare.fit import misfit
+from export_model.exporter.compare.reading import ReadCandidate, read_candidate
+from export_model.exporter.compare.weights import rounded_to
+from export_model.exporter.verify.participants import (
     Feeds,
 )
-from signatures.contract import POLICY
-from signatures.errors import ExportModelError, UsageError, suggestion
-from signatures.interface import Interface
-from signatures.roles import Role
-from signatures.spec import TensorSpec
+from export_model.signatures.contract import POLICY
+from export_model.signatures.errors import ExportModelError, UsageError, suggestion
+from export_model.signatures.interface import Interface
+from export_model.signatures.roles import Role
+from export_model.signatures.spec import TensorSpec
 
 
 class Problem(Struct, frozen=True):

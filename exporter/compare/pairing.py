@@ -6,10 +6,10 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from msgspec import Struct
 
-from converters.graph.ops.samplers import SAMPLERS
-from converters.policy.policy import Policy
-from signatures.roles import Role
-from signatures.spec import ActionHead, PolicySignature, TensorSpec
+from export_model.converters.graph.ops.samplers import SAMPLERS
+from export_model.converters.policy.policy import Policy
+from export_model.signatures.roles import Role
+from export_model.signatures.spec import ActionHead, PolicySignature, TensorSpec
 
 #: Roles that a draw decides the value of: they are alike only where both policies draw with the same noise.
 _OF_A_DRAW = frozenset((Role.SAMPLED, Role.LOG_PROB))

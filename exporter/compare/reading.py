@@ -13,23 +13,23 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from converters.compiler.options import CompileOptions
-from converters.compiler.passes.weights import Storage
-from converters.files.children.process import LoadedModel, RunFailedError
-from converters.formats.format import Format, WriteOptions
-from converters.formats.onnx.exporters import FAULT_NOTE
-from converters.formats.registry import FROZEN_GRAPH, KERNELS, ONNX
-from converters.formats.source import OriginalRun, ReadOptions
-from converters.policy.policy import Policy
-from converters.runtimes.pool import RuntimePool
-from exporter.compare.pairing import Pairing, axes_to, pair_policies, source_name, source_names
-from exporter.export.sources import read_source
-from exporter.verify.original import Original
-from exporter.verify.participants import Failure, Feeds, Participant
-from signatures.errors import SourceError
-from signatures.interface import Interface
-from signatures.roles import Role
-from signatures.spec import TensorSpec
+from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.compiler.passes.weights import Storage
+from export_model.converters.files.children.process import LoadedModel, RunFailedError
+from export_model.converters.formats.format import Format, WriteOptions
+from export_model.converters.formats.onnx.exporters import FAULT_NOTE
+from export_model.converters.formats.registry import FROZEN_GRAPH, KERNELS, ONNX
+from export_model.converters.formats.source import OriginalRun, ReadOptions
+from export_model.converters.policy.policy import Policy
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.compare.pairing import Pairing, axes_to, pair_policies, source_name, source_names
+from export_model.exporter.export.sources import read_source
+from export_model.exporter.verify.original import Original
+from export_model.exporter.verify.participants import Failure, Feeds, Participant
+from export_model.signatures.errors import SourceError
+from export_model.signatures.interface import Interface
+from export_model.signatures.roles import Role
+from export_model.signatures.spec import TensorSpec
 
 #: What a policy is written as where no runtime here loads its own file.
 _WRITTEN_AS = (ONNX, FROZEN_GRAPH)

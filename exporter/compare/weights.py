@@ -11,18 +11,18 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
-from converters.compiler.passes.weights import Storage, round_weights
-from converters.files.fetch import Fetched
-from converters.formats.bundle.bundle import Bundle
-from converters.formats.recognise import recognise_path
-from converters.policy.policy import Policy
-from exporter.export.options import storage_of
-from exporter.verify.checks.decisions import decisions
-from exporter.verify.participants import PolicyUnderTest, write_reference
-from exporter.verify.report import ParityReport
-from exporter.verify.session import Session
-from signatures.contract import POLICY, Contract, json_of, parse
-from signatures.errors import naming
+from export_model.converters.compiler.passes.weights import Storage, round_weights
+from export_model.converters.files.fetch import Fetched
+from export_model.converters.formats.bundle.bundle import Bundle
+from export_model.converters.formats.recognise import recognise_path
+from export_model.converters.policy.policy import Policy
+from export_model.exporter.export.options import storage_of
+from export_model.exporter.verify.checks.decisions import decisions
+from export_model.exporter.verify.participants import PolicyUnderTest, write_reference
+from export_model.exporter.verify.report import ParityReport
+from export_model.exporter.verify.session import Session
+from export_model.signatures.contract import POLICY, Contract, json_of, parse
+from export_model.signatures.errors import naming
 
 
 def rounded_to(path: Path) -> Storage | None:

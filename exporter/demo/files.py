@@ -9,13 +9,13 @@ from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
 
-from converters.files.folders import scratch_folder
-from converters.formats.bundle.bundle import writing
-from converters.formats.registry import BARRACUDA, ONNX
-from exporter.demo import BALL, FOLDER
-from exporter.export.options import ExportOptions
-from exporter.export.pipeline import export
-from signatures.errors import UsageError
+from export_model.converters.files.folders import scratch_folder
+from export_model.converters.formats.bundle.bundle import writing
+from export_model.converters.formats.registry import BARRACUDA, ONNX
+from export_model.exporter.demo import BALL, FOLDER
+from export_model.exporter.export.options import ExportOptions
+from export_model.exporter.export.pipeline import export
+from export_model.signatures.errors import UsageError
 
 #: The runs of the documentation: a folder for each behavior, as ML-Agents 0.7 to 0.23 leaves it, and as 2.0 does.
 _FIRST, _SECOND = "results/first_run", "results/second_run/3DBall"
@@ -77,10 +77,13 @@ def _forms() -> dict[str, bytes]:
 
 def _environments() -> dict[str, bytes]:
     """Their Gymnasium form, and what it imports: the package's own modules, each beside the others."""
-    form = files("exporter.demo").joinpath("gymnasium_form.py.tmpl").read_bytes()
-    room = files("exporter.play.environments")
+    form = files("export_model.exporter.demo").joinpath("gymnasium_form.py.tmpl").read_bytes()
+    room = files("export_model.exporter.play.environments")
     own = {f"environments/{name}.py": room.joinpath(f"{name}.py").read_text(encoding="utf-8") for name in _WORLDS}
     return {
         "environments/__init__.py": form,
-        **{path: text.replace("from exporter.play.environments.", "from .").encode() for path, text in own.items()},
+        **{
+            path: text.replace("from export_model.exporter.play.environments.", "from .").encode()
+            for path, text in own.items()
+        },
     }

@@ -9,36 +9,36 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from converters.files.folders import scratch_folder
-from converters.formats.bundle.bundle import Bundle, unfit
-from converters.formats.bundle.embed import runnable
-from converters.formats.format import Format
-from converters.formats.programs.artifact import can_confine
-from converters.formats.registry import FROZEN_GRAPH, KERNELS, WRITTEN, own_reference
-from converters.formats.saved_model.writer import signatures_of
-from converters.formats.source import NO_NORMALISER, OriginalRun, ReadOptions
-from converters.graph.nodes import Graph, Node, TensorShape
-from converters.policy.policy import Policy
-from converters.runtimes.pool import RuntimePool, chosen_runtimes, unverified_error
-from exporter.export.job import Job, own_in, runs_elsewhere
-from exporter.export.options import storage_of
-from exporter.export.pipeline import Progress, consumer, join_reports
-from exporter.export.remade import baked_again, compiled_again, made_again, read_back, tensors
-from exporter.export.sources import Source, read_source
-from exporter.verify.checks.decisions import decisions
-from exporter.verify.options import VerifyOptions
-from exporter.verify.participants import policy_under_test, write_reference
-from exporter.verify.plays import read_plays
-from exporter.verify.report import ParityReport
-from exporter.verify.session import Session
-from exporter.verify.verdict import reference_text
-from exporter.verify.verification import verify
-from signatures.code import CodeOptions
-from signatures.contract import POLICY, Contract
-from signatures.errors import BundleError, UsageError, naming
-from signatures.fields import printable
-from signatures.roles import Role
-from signatures.spec import PolicySignature
+from export_model.converters.files.folders import scratch_folder
+from export_model.converters.formats.bundle.bundle import Bundle, unfit
+from export_model.converters.formats.bundle.embed import runnable
+from export_model.converters.formats.format import Format
+from export_model.converters.formats.programs.artifact import can_confine
+from export_model.converters.formats.registry import FROZEN_GRAPH, KERNELS, WRITTEN, own_reference
+from export_model.converters.formats.saved_model.writer import signatures_of
+from export_model.converters.formats.source import NO_NORMALISER, OriginalRun, ReadOptions
+from export_model.converters.graph.nodes import Graph, Node, TensorShape
+from export_model.converters.policy.policy import Policy
+from export_model.converters.runtimes.pool import RuntimePool, chosen_runtimes, unverified_error
+from export_model.exporter.export.job import Job, own_in, runs_elsewhere
+from export_model.exporter.export.options import storage_of
+from export_model.exporter.export.pipeline import Progress, consumer, join_reports
+from export_model.exporter.export.remade import baked_again, compiled_again, made_again, read_back, tensors
+from export_model.exporter.export.sources import Source, read_source
+from export_model.exporter.verify.checks.decisions import decisions
+from export_model.exporter.verify.options import VerifyOptions
+from export_model.exporter.verify.participants import policy_under_test, write_reference
+from export_model.exporter.verify.plays import read_plays
+from export_model.exporter.verify.report import ParityReport
+from export_model.exporter.verify.session import Session
+from export_model.exporter.verify.verdict import reference_text
+from export_model.exporter.verify.verification import verify
+from export_model.signatures.code import CodeOptions
+from export_model.signatures.contract import POLICY, Contract
+from export_model.signatures.errors import BundleError, UsageError, naming
+from export_model.signatures.fields import printable
+from export_model.signatures.roles import Role
+from export_model.signatures.spec import PolicySignature
 
 #: Of a bundle whose policy is not made from its source by any choice that is known.
 OWN_REFERENCE = (

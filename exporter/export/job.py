@@ -13,23 +13,23 @@ from typing import TYPE_CHECKING, Any
 from msgspec import Struct
 from msgspec.structs import replace
 
-from converters.compiler.passes.weights import Storage, round_weights
-from converters.formats.bundle.embed import FIXED_BATCH
-from converters.formats.format import Artifact, Format, WriteOptions
-from converters.formats.registry import ONNX, WRITTEN
-from converters.formats.source import ReadOptions, SourceModel
-from converters.policy.policy import Policy
-from exporter import __version__
-from exporter.export.options import ExportOptions
-from exporter.export.sources import Source
-from signatures.code import CodeOptions
-from signatures.contract import Contract, Origin, parse
-from signatures.errors import SignatureError, TooLargeError, UsageError, naming
-from signatures.fields import FieldError, printable
+from export_model.converters.compiler.passes.weights import Storage, round_weights
+from export_model.converters.formats.bundle.embed import FIXED_BATCH
+from export_model.converters.formats.format import Artifact, Format, WriteOptions
+from export_model.converters.formats.registry import ONNX, WRITTEN
+from export_model.converters.formats.source import ReadOptions, SourceModel
+from export_model.converters.policy.policy import Policy
+from export_model.exporter import __version__
+from export_model.exporter.export.options import ExportOptions
+from export_model.exporter.export.sources import Source
+from export_model.signatures.code import CodeOptions
+from export_model.signatures.contract import Contract, Origin, parse
+from export_model.signatures.errors import SignatureError, TooLargeError, UsageError, naming
+from export_model.signatures.fields import FieldError, printable
 
 if TYPE_CHECKING:
-    from converters.consumers.profile import Profile
-    from exporter.verify.participants import PolicyUnderTest
+    from export_model.converters.consumers.profile import Profile
+    from export_model.exporter.verify.participants import PolicyUnderTest
 if not TYPE_CHECKING:  # what asks a record for its signature looks these names up
     Profile = Any
 
@@ -97,12 +97,12 @@ def artefacts_of(
         how = job.profile.write_options(contract.compact())
         artifacts = [_artifact(f, job.policy, how) for f in formats]
         for artifact in artifacts if job.profile.loaders else ():
-            from converters.consumers.robots.loaders import loadable
+            from export_model.converters.consumers.robots.loaders import loadable
 
             loadable(job.profile.name, job.profile.loaders, artifact.files[artifact.main].to_bytes(), job.policy.name)
         if job.profile.importers:
-            from converters.consumers.importable import importable
-            from converters.consumers.playable import playable
+            from export_model.converters.consumers.importable import importable
+            from export_model.converters.consumers.playable import playable
 
             for artifact in artifacts:
                 importable(job.profile, artifact.files, job.policy.name)
@@ -113,7 +113,7 @@ def artefacts_of(
 def _artifact(form: Format, policy: Policy, how: WriteOptions) -> Artifact:
     if not form.consumer:  # a plain export loads nothing of consumers
         return form.artifact(policy, how)
-    from converters.consumers.named_files import artifact_of
+    from export_model.converters.consumers.named_files import artifact_of
 
     return artifact_of(form, policy, how)
 
@@ -160,7 +160,7 @@ def contract_of(
 
 def under_test(job: Job, stage: Path, artifacts: Sequence[Artifact], scratch: Path) -> PolicyUnderTest:
     """A policy whose artefacts lie in ``stage``; what else verification needs is put into ``scratch``."""
-    from exporter.verify.participants import policy_under_test
+    from export_model.exporter.verify.participants import policy_under_test
 
     paths = {a.format.key: stage / a.main for a in artifacts}
     return policy_under_test(
@@ -279,7 +279,7 @@ def check_bake(options: ExportOptions) -> None:
 
 def bake(job: Job, what: str) -> Job:
     """The policy whose graph computes what is stated of its action; ``own`` is the one before."""
-    from converters.compiler.passes.bake import BAKED
+    from export_model.converters.compiler.passes.bake import BAKED
 
     with naming(job.source.path):
         baked = BAKED[what](job.policy)

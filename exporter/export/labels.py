@@ -8,15 +8,15 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from converters.interfaces.fit import fit_interface, name_numbers
-from converters.interfaces.merge import merge
-from converters.policy.policy import Policy
-from exporter.options_file import read_options
-from signatures.errors import UsageError
-from signatures.fields import FieldError
-from signatures.interface import parse_interface
-from signatures.labels import validate_labels
-from signatures.spec import PolicySignature
+from export_model.converters.interfaces.fit import fit_interface, name_numbers
+from export_model.converters.interfaces.merge import merge
+from export_model.converters.policy.policy import Policy
+from export_model.exporter.options_file import read_options
+from export_model.signatures.errors import UsageError
+from export_model.signatures.fields import FieldError
+from export_model.signatures.interface import parse_interface
+from export_model.signatures.labels import validate_labels
+from export_model.signatures.spec import PolicySignature
 
 _INTERFACE = "interface"
 #: Tables within tables of an interface.

@@ -9,8 +9,8 @@ from typing import Generic, Protocol, TypeVar
 
 from msgspec import Struct, field
 
-from converters.files.fetch import address_of, path_text
-from signatures.contract import safe_name
+from export_model.converters.files.fetch import address_of, path_text
+from export_model.signatures.contract import safe_name
 
 #: A name, and why it is another than the source's.
 Claimed = tuple[str, str | None]

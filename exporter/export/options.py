@@ -8,13 +8,13 @@ from typing import get_args
 
 from msgspec import Struct, field
 
-from converters.compiler.options import CompileOptions
-from converters.compiler.passes.weights import Storage
-from converters.formats.source import ReadOptions
-from exporter.export.labels import Labels
-from exporter.verify.options import VerifyOptions
-from signatures.code import CodeOptions
-from signatures.errors import UsageError
+from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.compiler.passes.weights import Storage
+from export_model.converters.formats.source import ReadOptions
+from export_model.exporter.export.labels import Labels
+from export_model.exporter.verify.options import VerifyOptions
+from export_model.signatures.code import CodeOptions
+from export_model.signatures.errors import UsageError
 
 
 class ExportOptions(Struct, frozen=True):

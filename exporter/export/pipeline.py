@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 from msgspec import Struct, field
 from msgspec.structs import replace
 
-from converters.files.fetch import path_text
-from converters.files.folders import scratch_folder
-from converters.formats.bundle import bundle
-from converters.formats.format import Artifact, Format
-from converters.formats.registry import DEFAULTS, WRITTEN, format_for_writing
-from converters.policy.policy import Policy
-from exporter.export.job import (
+from export_model.converters.files.fetch import path_text
+from export_model.converters.files.folders import scratch_folder
+from export_model.converters.formats.bundle import bundle
+from export_model.converters.formats.format import Artifact, Format
+from export_model.converters.formats.registry import DEFAULTS, WRITTEN, format_for_writing
+from export_model.converters.policy.policy import Policy
+from export_model.exporter.export.job import (
     Job,
     artefacts_of,
     bake,
@@ -32,29 +32,29 @@ from exporter.export.job import (
     smaller,
     under_test,
 )
-from exporter.export.labels import check_labels, read_labels, with_labels
-from exporter.export.names import Names, Naming
-from exporter.export.options import ExportOptions
-from exporter.export.sources import Source, read_source
-from exporter.remote.fetching import name_address, nearby
-from exporter.remote.filesystem import remote
-from exporter.remote.sending import check_free, check_sendable, landing
-from exporter.tables import count_text
-from exporter.verify.checks.size import check_budget
-from exporter.verify.tolerances import check_rules
-from signatures.contract import PARITY, Contract, safe_name
-from signatures.errors import (
+from export_model.exporter.export.labels import check_labels, read_labels, with_labels
+from export_model.exporter.export.names import Names, Naming
+from export_model.exporter.export.options import ExportOptions
+from export_model.exporter.export.sources import Source, read_source
+from export_model.exporter.remote.fetching import name_address, nearby
+from export_model.exporter.remote.filesystem import remote
+from export_model.exporter.remote.sending import check_free, check_sendable, landing
+from export_model.exporter.tables import count_text
+from export_model.exporter.verify.checks.size import check_budget
+from export_model.exporter.verify.tolerances import check_rules
+from export_model.signatures.contract import PARITY, Contract, safe_name
+from export_model.signatures.errors import (
     ExportModelError,
     RefusedError,
     UsageError,
 )
-from signatures.fields import printable
+from export_model.signatures.fields import printable
 
 if TYPE_CHECKING:
-    from converters.consumers.profile import Profile
-    from converters.runtimes.pool import RuntimePool
-    from converters.runtimes.registry import RuntimeInfo
-    from exporter.verify.report import ParityReport
+    from export_model.converters.consumers.profile import Profile
+    from export_model.converters.runtimes.pool import RuntimePool
+    from export_model.converters.runtimes.registry import RuntimeInfo
+    from export_model.exporter.verify.report import ParityReport
 else:
     ParityReport = Any  # help() evaluates the annotations of a Struct
 
@@ -79,14 +79,14 @@ class ExportResult(Struct, frozen=True):
     def __repr__(self) -> str:
         verdict = "not verified"
         if self.report is not None and self.report.passed is not None:
-            from exporter.verify.verdict import checked_formats, formats_of
+            from export_model.exporter.verify.verdict import checked_formats, formats_of
 
             count = f"{len(checked_formats(self.report))} of {count_text(len(formats_of(self.report)), 'format')}"
             verdict = f"{self.report.verdict} ({count})"
         return f"<ExportResult {self.policy.name!r} {verdict}: {', '.join(self.sizes)} in {path_text(self.folder)!r}>"
 
     def _repr_html_(self) -> str:
-        from exporter.reports.markup import notebook
+        from export_model.exporter.reports.markup import notebook
 
         return notebook(repr(self)) if self.report is None else notebook(repr(self)) + self.report._repr_html_()
 
@@ -140,7 +140,9 @@ class Exporter:
         self.runtimes: tuple[str, ...] = ()
         self._known: list[RuntimeInfo] = []
         if options.verify != "none":
-            from converters.runtimes.pool import chosen_runtimes  # a cold start without verification needs none of it
+            from export_model.converters.runtimes.pool import (
+                chosen_runtimes,  # a cold start without verification needs none of it
+            )
 
             self.runtimes, self._known = chosen_runtimes(options.verify, self._formats)
         _check_parity(options, self._formats)
@@ -232,8 +234,8 @@ class Exporter:
         ):
             report = None
             if self.runtimes:
-                from exporter.verify.session import Session
-                from exporter.verify.verification import verify
+                from export_model.exporter.verify.session import Session
+                from export_model.exporter.verify.verification import verify
 
                 assert pool is not None, "runtimes run in processes"
                 tested = under_test(job, stage, artifacts, folder)
@@ -245,7 +247,7 @@ class Exporter:
                     other = verify(under, beside)
                     report = join_reports(report, other)
                 if job.whole is not None:
-                    from exporter.verify.checks.decisions import decisions
+                    from export_model.exporter.verify.checks.decisions import decisions
 
                     whole = under_test(replace(job, policy=job.whole, whole=None), stage, (), folder / "whole")
                     own = verify(whole, beside)
@@ -295,7 +297,7 @@ def export(
     done = 0
     with contextlib.ExitStack() as opened:
         if pool is None and exporter.runtimes:
-            from converters.runtimes.pool import RuntimePool
+            from export_model.converters.runtimes.pool import RuntimePool
 
             pool = opened.enter_context(RuntimePool())
         for number, path in enumerate(paths, 1):
@@ -332,7 +334,7 @@ def numbered_progress(progress: Progress, number: int, total: int) -> Progress:
 
 def consumer(name: str) -> Profile:
     """The profile that ``--for`` names. Raises UsageError."""
-    from converters.consumers.profiles import profile  # most exports are for no consumer in particular
+    from export_model.converters.consumers.profiles import profile  # most exports are for no consumer in particular
 
     return profile(name)
 
@@ -344,7 +346,7 @@ def _check_parity(options: ExportOptions, formats: Sequence[Format]) -> None:
         parity.check_unverified()
     check_budget(parity.budget, {f.key: 0 for f in formats})
     if parity.golden is not None:
-        from exporter.verify.golden import read_recording
+        from export_model.exporter.verify.golden import read_recording
 
         read_recording(Path(parity.golden))
 

@@ -8,24 +8,24 @@ from typing import TYPE_CHECKING, get_args
 
 from msgspec.structs import replace
 
-from converters.compiler.options import CompileOptions, NoiseMode
-from converters.formats.bundle.bundle import Bundle, unfit
-from converters.formats.format import Format
-from converters.formats.registry import WRITTEN
-from converters.formats.source import ReadOptions, SourceModel
-from converters.interfaces.isaac_lab import RAW_ACTION
-from converters.interfaces.registry import NO_INTERFACE
-from converters.policy.policy import Policy
-from exporter.export.job import Job, bake, smaller
-from exporter.export.options import storage_of
-from exporter.export.sources import Source, read_source
-from signatures.contract import POLICY, Contract, safe_name
-from signatures.errors import BundleError
-from signatures.interface import Quantity
-from signatures.spec import PolicySignature, SourceMap
+from export_model.converters.compiler.options import CompileOptions, NoiseMode
+from export_model.converters.formats.bundle.bundle import Bundle, unfit
+from export_model.converters.formats.format import Format
+from export_model.converters.formats.registry import WRITTEN
+from export_model.converters.formats.source import ReadOptions, SourceModel
+from export_model.converters.interfaces.isaac_lab import RAW_ACTION
+from export_model.converters.interfaces.registry import NO_INTERFACE
+from export_model.converters.policy.policy import Policy
+from export_model.exporter.export.job import Job, bake, smaller
+from export_model.exporter.export.options import storage_of
+from export_model.exporter.export.sources import Source, read_source
+from export_model.signatures.contract import POLICY, Contract, safe_name
+from export_model.signatures.errors import BundleError
+from export_model.signatures.interface import Quantity
+from export_model.signatures.spec import PolicySignature, SourceMap
 
 if TYPE_CHECKING:
-    from converters.consumers.profile import Profile
+    from export_model.converters.consumers.profile import Profile
 
 
 def made_again(found: Source, contract: Contract, wanted: Profile) -> Job:

@@ -9,14 +9,14 @@ from pathlib import Path
 from msgspec import Struct, field
 from msgspec.structs import replace
 
-from converters.compiler.compile import compile_graph, explanations
-from converters.compiler.options import CompileOptions
-from converters.formats.format import Format
-from converters.formats.read import check_options, each_or_refused, fetch, read_models
-from converters.formats.source import ReadOptions, SourceModel
-from converters.policy.policy import Policy
-from converters.policy.rules import Decision
-from signatures.errors import ExportModelError, naming
+from export_model.converters.compiler.compile import compile_graph, explanations
+from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.formats.format import Format
+from export_model.converters.formats.read import check_options, each_or_refused, fetch, read_models
+from export_model.converters.formats.source import ReadOptions, SourceModel
+from export_model.converters.policy.policy import Policy
+from export_model.converters.policy.rules import Decision
+from export_model.signatures.errors import ExportModelError, naming
 
 #: File names that say nothing of the policy: the folder's name, its behavior, does.
 _NAMELESS = ("frozen_graph_def.pb", "saved_model.pb", "model.json", "checkpoint")
@@ -82,8 +82,8 @@ def live_source(kind: str, given: object) -> Iterator[Source]:
     It lasts as long as the context: what TensorFlow runs the original from lies in a temporary folder. Raises
     UsageError, and what ``read_source`` raises.
     """
-    from converters.files.folders import scratch_folder
-    from converters.formats.live.source import label, read_live
+    from export_model.converters.files.folders import scratch_folder
+    from export_model.converters.formats.live.source import label, read_live
 
     with scratch_folder() as folder:
         place = Path(label(kind))

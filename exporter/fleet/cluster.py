@@ -23,15 +23,15 @@ from typing import Any
 from msgspec import Struct
 from msgspec.structs import replace
 
-from converters.files.fetch import address_of, path_text
-from converters.runtimes.pool import RuntimePool
-from exporter import __version__
-from exporter.export.labels import read_labels
-from exporter.export.names import Claim, Claimed, Turns
-from exporter.export.options import ExportOptions
-from exporter.export.pipeline import Exporter
-from exporter.fleet.worker import Outcome, Wanted, export_source
-from signatures.errors import RuntimeUnavailableError, SourceError, UsageError
+from export_model.converters.files.fetch import address_of, path_text
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter import __version__
+from export_model.exporter.export.labels import read_labels
+from export_model.exporter.export.names import Claim, Claimed, Turns
+from export_model.exporter.export.options import ExportOptions
+from export_model.exporter.export.pipeline import Exporter
+from export_model.exporter.fleet.worker import Outcome, Wanted, export_source
+from export_model.signatures.errors import RuntimeUnavailableError, SourceError, UsageError
 
 #: Seconds in which a scheduler answers.
 _PATIENCE = 15

@@ -19,14 +19,14 @@ from typing import Any
 
 from msgspec import Struct, field
 
-from converters.files.fetch import path_text
-from converters.runtimes.pool import RuntimePool
-from exporter.export.names import Claim, Names, Turns
-from exporter.export.options import ExportOptions
-from exporter.export.pipeline import Exporter
-from exporter.fleet.ledger import Ledger
-from exporter.fleet.worker import Outcome, Wanted, export_source, work
-from signatures.errors import SourceError, UsageError
+from export_model.converters.files.fetch import path_text
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.export.names import Claim, Names, Turns
+from export_model.exporter.export.options import ExportOptions
+from export_model.exporter.export.pipeline import Exporter
+from export_model.exporter.fleet.ledger import Ledger
+from export_model.exporter.fleet.worker import Outcome, Wanted, export_source, work
+from export_model.signatures.errors import SourceError, UsageError
 
 #: How long a worker may take to clean up when it is told to end.
 _GRACE_SECONDS = 10.0
@@ -67,7 +67,7 @@ def export_fleet(
             names.reserve(path, name)
         yield Outcome(path, unchanged=True)
     if cluster is not None:
-        from exporter.fleet.cluster import Cluster
+        from export_model.exporter.fleet.cluster import Cluster
 
         made = Cluster(cluster, options, wanted, Turns(names), waiting).run()
     elif jobs == 1 or len(waiting) < 2:

@@ -10,17 +10,17 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from converters.files.fetch import address_of, path_text, read_bytes
-from converters.formats.bundle.bundle import Bundle
-from exporter import __version__
-from exporter.export.labels import read_labels
-from exporter.export.options import ExportOptions
-from exporter.fleet.marks import is_marked, mark, read_key
-from exporter.remote.fetching import version
-from exporter.remote.filesystem import remote
-from signatures.contract import POLICY, safe_name
-from signatures.digest import sha256_hex
-from signatures.errors import BundleError, ExportModelError, SourceError
+from export_model.converters.files.fetch import address_of, path_text, read_bytes
+from export_model.converters.formats.bundle.bundle import Bundle
+from export_model.exporter import __version__
+from export_model.exporter.export.labels import read_labels
+from export_model.exporter.export.options import ExportOptions
+from export_model.exporter.fleet.marks import is_marked, mark, read_key
+from export_model.exporter.remote.fetching import version
+from export_model.exporter.remote.filesystem import remote
+from export_model.signatures.contract import POLICY, safe_name
+from export_model.signatures.digest import sha256_hex
+from export_model.signatures.errors import BundleError, ExportModelError, SourceError
 
 _NAME = ".exported.jsonl"
 #: size, time of the last change in ns, sha256

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from converters.runtimes.installed import cache_folder
+from export_model.converters.runtimes.installed import cache_folder
 
 _BYTES = 32
 

@@ -9,12 +9,12 @@ from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 
-from converters.files.fetch import Fetched, path_text, unreadable
-from converters.formats.bundle import BUNDLE
-from converters.formats.recognise import recognise_path
-from converters.formats.source import ReadOptions
-from exporter.remote.filesystem import is_pattern, matching, remote
-from signatures.errors import SourceError, UsageError
+from export_model.converters.files.fetch import Fetched, path_text, unreadable
+from export_model.converters.formats.bundle import BUNDLE
+from export_model.converters.formats.recognise import recognise_path
+from export_model.converters.formats.source import ReadOptions
+from export_model.exporter.remote.filesystem import is_pattern, matching, remote
+from export_model.signatures.errors import SourceError, UsageError
 
 #: Bytes of a list of paths.
 MAX_LIST = 16 << 20

@@ -12,16 +12,16 @@ from typing import Any
 
 from msgspec import Struct
 
-from converters.files.children.child import end_with_parent
-from converters.files.fetch import path_text
-from converters.runtimes.pool import RuntimePool
-from exporter.export.names import Claim, Claimed, Naming
-from exporter.export.options import ExportOptions
-from exporter.export.pipeline import Exporter, ExportResult, near
-from exporter.fleet.ledger import Stamp, State, stamps, state
-from exporter.reports.entry import Entry, of_result
-from signatures.cycles import raise_gc_threshold
-from signatures.errors import ExportModelError, RefusedError, SourceError
+from export_model.converters.files.children.child import end_with_parent
+from export_model.converters.files.fetch import path_text
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.export.names import Claim, Claimed, Naming
+from export_model.exporter.export.options import ExportOptions
+from export_model.exporter.export.pipeline import Exporter, ExportResult, near
+from export_model.exporter.fleet.ledger import Stamp, State, stamps, state
+from export_model.exporter.reports.entry import Entry, of_result
+from export_model.signatures.cycles import raise_gc_threshold
+from export_model.signatures.errors import ExportModelError, RefusedError, SourceError
 
 
 class Written(Struct, frozen=True):

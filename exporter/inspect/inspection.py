@@ -10,27 +10,27 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from msgspec import Struct, field
 
-from converters.compiler.options import CompileOptions
-from converters.consumers.named_files import artifact_of
-from converters.formats.format import Format, WriteOptions
-from converters.formats.registry import LITERT, WRITTEN
-from converters.formats.source import ReadOptions
-from converters.graph.nodes import Graph
-from converters.interfaces.text import kept_text, loop_lines, tables
-from converters.policy.policy import Policy
-from converters.policy.rules import Decision
-from exporter.export.sources import read_source
-from exporter.reports.layers import blocks_of, chain
-from exporter.tables import count_text, paragraph, size_text, table
-from signatures.contract import safe_name
-from signatures.errors import ExportModelError, naming
-from signatures.fields import printable
-from signatures.ids import bounds_text
-from signatures.roles import Role
-from signatures.spec import PolicySignature, TensorSpec
+from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.consumers.named_files import artifact_of
+from export_model.converters.formats.format import Format, WriteOptions
+from export_model.converters.formats.registry import LITERT, WRITTEN
+from export_model.converters.formats.source import ReadOptions
+from export_model.converters.graph.nodes import Graph
+from export_model.converters.interfaces.text import kept_text, loop_lines, tables
+from export_model.converters.policy.policy import Policy
+from export_model.converters.policy.rules import Decision
+from export_model.exporter.export.sources import read_source
+from export_model.exporter.reports.layers import blocks_of, chain
+from export_model.exporter.tables import count_text, paragraph, size_text, table
+from export_model.signatures.contract import safe_name
+from export_model.signatures.errors import ExportModelError, naming
+from export_model.signatures.fields import printable
+from export_model.signatures.ids import bounds_text
+from export_model.signatures.roles import Role
+from export_model.signatures.spec import PolicySignature, TensorSpec
 
 if TYPE_CHECKING:
-    from converters.formats.litert.microcontrollers import Fit
+    from export_model.converters.formats.litert.microcontrollers import Fit
 if not TYPE_CHECKING:  # what asks a record for its signature looks these names up
     Fit = Any
 
@@ -116,7 +116,7 @@ class Inspection(Struct, frozen=True):
         return f"<Inspection of {str(self.path)!r}: {self.kind}, {names}{more}>"
 
     def _repr_html_(self) -> str:
-        from exporter.reports.markup import notebook
+        from export_model.exporter.reports.markup import notebook
 
         tables = [t for p in self.policies for t in port_tables(p.policy.signature)]
         return notebook(f"{self.path}: {self.kind}, {size_text(self.size)}", *tables)
@@ -208,7 +208,7 @@ def _refusal(path: Path, policy: Policy, target: Format) -> str | None:
 
 def _board(path: Path, policy: Policy) -> Fit | None:
     """How the file for one agent would run on a board; None where it is for any number alone."""
-    from converters.formats.litert.microcontrollers import fit
+    from export_model.converters.formats.litert.microcontrollers import fit
 
     try:
         with naming(path):

@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from converters.formats.bundle.bundle import distinct_names, writing
-from signatures.contract import safe_name
-from signatures.errors import BundleError, UsageError
+from export_model.converters.formats.bundle.bundle import distinct_names, writing
+from export_model.signatures.contract import safe_name
+from export_model.signatures.errors import BundleError, UsageError
 
 if TYPE_CHECKING:
-    from exporter.inspect.inspection import Inspection
+    from export_model.exporter.inspect.inspection import Inspection
 
 
 def write_pictures(inspection: Inspection, logdir: Path | None = None, svg: Path | None = None) -> list[Path]:
@@ -23,12 +23,12 @@ def write_pictures(inspection: Inspection, logdir: Path | None = None, svg: Path
     if logdir is not None:
         if not inspection.graphs:
             raise UsageError(f"--logdir {logdir}: the source has no graph", fix="give the file of a policy")
-        from converters.formats.tensorboard import FILE_NAME, event_file
+        from export_model.converters.formats.tensorboard import FILE_NAME, event_file
 
         distinct_names([(name, f"model {i}") for i, (name, _) in enumerate(inspection.graphs)])
         files.update({logdir / name / FILE_NAME: event_file(graph) for name, graph in inspection.graphs})
     if svg is not None:
-        from exporter.reports.picture import picture
+        from export_model.exporter.reports.picture import picture
 
         policies = [inspected.policy for inspected in inspection.policies]
         several = len(policies) > 1

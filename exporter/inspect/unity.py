@@ -6,15 +6,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from converters.consumers.unity.checker import ModeVerdict, UnityVerdict, check_file
-from converters.consumers.unity.consumers import CONSUMERS, consumer
-from converters.consumers.unity.findings import Finding, Thrown
-from converters.consumers.unity.players import PLAYERS
-from converters.consumers.unity.playing import Played
-from converters.consumers.unity.settings import Brain, parse_actions, parse_sensors, read_brain
-from exporter.tables import paragraph
-from signatures.errors import UsageError
-from signatures.fields import printable
+from export_model.converters.consumers.unity.checker import ModeVerdict, UnityVerdict, check_file
+from export_model.converters.consumers.unity.consumers import CONSUMERS, consumer
+from export_model.converters.consumers.unity.findings import Finding, Thrown
+from export_model.converters.consumers.unity.players import PLAYERS
+from export_model.converters.consumers.unity.playing import Played
+from export_model.converters.consumers.unity.settings import Brain, parse_actions, parse_sensors, read_brain
+from export_model.exporter.tables import paragraph
+from export_model.signatures.errors import UsageError
+from export_model.signatures.fields import printable
 
 _MODES = {"stochastic": "Deterministic Inference off", "deterministic": "Deterministic Inference on"}
 _READ = (".onnx", ".nn")

@@ -13,10 +13,10 @@ from itertools import combinations, pairwise
 import numpy as np
 from msgspec import Struct
 
-from exporter.logs.recording import NONE, Array, Arrays, Recording
-from exporter.logs.replay import MemoryUse
-from signatures.roles import Role
-from signatures.spec import PolicySignature, TensorSpec
+from export_model.exporter.logs.recording import NONE, Array, Arrays, Recording
+from export_model.exporter.logs.replay import MemoryUse
+from export_model.signatures.roles import Role
+from export_model.signatures.spec import PolicySignature, TensorSpec
 
 #: Units that are mixed up: factor, and what it looks like.
 UNITS: tuple[tuple[float, str], ...] = (

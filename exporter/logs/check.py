@@ -10,18 +10,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from msgspec import Struct
 
-from exporter.logs.causes import Cause
-from exporter.logs.judging import LOG_TOLERANCE, Target, targets_of
-from exporter.logs.reading import log_error, read_recording
-from exporter.logs.recording import Array, Recording
-from exporter.logs.replay import Replay
-from exporter.logs.search import LEAST, explain
-from exporter.logs.trials import Trials, Verdict
-from exporter.verify.tolerances import Tolerance
-from signatures.fields import Record
+from export_model.exporter.logs.causes import Cause
+from export_model.exporter.logs.judging import LOG_TOLERANCE, Target, targets_of
+from export_model.exporter.logs.reading import log_error, read_recording
+from export_model.exporter.logs.recording import Array, Recording
+from export_model.exporter.logs.replay import Replay
+from export_model.exporter.logs.search import LEAST, explain
+from export_model.exporter.logs.trials import Trials, Verdict
+from export_model.exporter.verify.tolerances import Tolerance
+from export_model.signatures.fields import Record
 
 if TYPE_CHECKING:
-    from exporter.acting.policy import LoadedPolicy
+    from export_model.exporter.acting.policy import LoadedPolicy
 
 
 class WorstStep(Record, frozen=True):

@@ -11,10 +11,10 @@ from collections.abc import Sequence
 import numpy as np
 from msgspec import Struct
 
-from exporter.logs.causes import Cause, InputChange, column_name, on, scale_column, vectors
-from exporter.logs.recording import Array, Recording
-from exporter.logs.trials import Chain, Trials
-from signatures.spec import PolicySignature
+from export_model.exporter.logs.causes import Cause, InputChange, column_name, on, scale_column, vectors
+from export_model.exporter.logs.recording import Array, Recording
+from export_model.exporter.logs.trials import Chain, Trials
+from export_model.signatures.spec import PolicySignature
 
 TURNS = 14
 #: Where the search starts: as it is, and turned round.

@@ -9,10 +9,10 @@ from itertools import pairwise
 import numpy as np
 from msgspec import Struct
 
-from exporter.logs.recording import Array, Arrays, Recording
-from exporter.verify.tolerances import Tolerance
-from signatures.roles import Role
-from signatures.spec import ActionHead, PolicySignature, TensorSpec
+from export_model.exporter.logs.recording import Array, Arrays, Recording
+from export_model.exporter.verify.tolerances import Tolerance
+from export_model.signatures.roles import Role
+from export_model.signatures.spec import ActionHead, PolicySignature, TensorSpec
 
 #: What a log and the policy may differ by: one is of another machine, often of a GPU, and passed through text.
 LOG_TOLERANCE = Tolerance(1e-4, 1e-4, "a log is of another machine")

@@ -6,13 +6,13 @@ import math
 
 import numpy as np
 
-from exporter import __version__
-from exporter.logs.check import LogReport
-from exporter.logs.recording import Array
-from exporter.logs.wording import report_lines, sentence
-from exporter.reports.markup import Markup, el, svg
-from exporter.reports.page import document
-from exporter.reports.sections import section, table
+from export_model.exporter import __version__
+from export_model.exporter.logs.check import LogReport
+from export_model.exporter.logs.recording import Array
+from export_model.exporter.logs.wording import report_lines, sentence
+from export_model.exporter.reports.markup import Markup, el, svg
+from export_model.exporter.reports.page import document
+from export_model.exporter.reports.sections import section, table
 
 #: Points of a line: of more steps, the worst of each stretch.
 MOST_POINTS = 600

@@ -14,14 +14,14 @@ from typing import TextIO
 
 import numpy as np
 
-from exporter.logs.recording import Array, Recording, links
-from exporter.logs.replay import complete
-from exporter.verify.golden import read_arrays
-from signatures.bounded import loads
-from signatures.errors import UsageError
-from signatures.ids import check_ids
-from signatures.roles import Role
-from signatures.spec import PolicySignature, TensorSpec
+from export_model.exporter.logs.recording import Array, Recording, links
+from export_model.exporter.logs.replay import complete
+from export_model.exporter.verify.golden import read_arrays
+from export_model.signatures.bounded import loads
+from export_model.signatures.errors import UsageError
+from export_model.signatures.ids import check_ids
+from export_model.signatures.roles import Role
+from export_model.signatures.spec import PolicySignature, TensorSpec
 
 #: What a log may say beside the policy's tensors: which agent and episode a step is of, and whether it ends there.
 AGENT, EPISODE, DONE = "agent", "episode", "done"

@@ -9,10 +9,10 @@ from enum import StrEnum
 import numpy as np
 from msgspec import Struct
 
-from exporter.logs.recording import NONE, Array, Arrays
-from signatures.batches import Run
-from signatures.roles import Role
-from signatures.spec import PolicySignature
+from export_model.exporter.logs.recording import NONE, Array, Arrays
+from export_model.signatures.batches import Run
+from export_model.signatures.roles import Role
+from export_model.signatures.spec import PolicySignature
 
 #: Elements of one input that are run at once.
 CHUNK_ELEMENTS = 1 << 21

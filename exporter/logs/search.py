@@ -12,12 +12,12 @@ from collections.abc import Sequence
 import numpy as np
 from msgspec import Struct
 
-from exporter.logs.causes import Cause, action_causes, drawn_action_causes, input_causes, lag_causes
-from exporter.logs.fitting import fitted_causes, scanned_causes
-from exporter.logs.judging import ties
-from exporter.logs.recording import NONE, Array, Recording
-from exporter.logs.replay import MemoryUse
-from exporter.logs.trials import Chain, Trials, Verdict
+from export_model.exporter.logs.causes import Cause, action_causes, drawn_action_causes, input_causes, lag_causes
+from export_model.exporter.logs.fitting import fitted_causes, scanned_causes
+from export_model.exporter.logs.judging import ties
+from export_model.exporter.logs.recording import NONE, Array, Recording
+from export_model.exporter.logs.replay import MemoryUse
+from export_model.exporter.logs.trials import Chain, Trials, Verdict
 
 #: Steps that all causes are tried on, and that the best are tried on.
 FEW, MANY = 64, 5_000

@@ -7,8 +7,8 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from msgspec import Struct
 
-from exporter.logs.causes import Cause
-from exporter.logs.judging import (
+from export_model.exporter.logs.causes import Cause
+from export_model.exporter.logs.judging import (
     BEYOND,
     NOISE_STEP,
     Clip,
@@ -19,9 +19,9 @@ from exporter.logs.judging import (
     measured_spread,
     shares,
 )
-from exporter.logs.recording import NONE, Array, Arrays, Recording
-from exporter.logs.replay import CHUNK_ELEMENTS, MemoryUse, Replay
-from exporter.verify.tolerances import Tolerance
+from export_model.exporter.logs.recording import NONE, Array, Arrays, Recording
+from export_model.exporter.logs.replay import CHUNK_ELEMENTS, MemoryUse, Replay
+from export_model.exporter.verify.tolerances import Tolerance
 
 #: Inputs are moved by so much of their size, and by what text cut off, to see what rounding explains.
 MOVED = 2.0**-21

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from exporter.logs.check import LogReport
-from exporter.tables import count_text
+from export_model.exporter.logs.check import LogReport
+from export_model.exporter.tables import count_text
 
 
 def report_lines(report: LogReport) -> list[str]:

@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from msgspec import Struct
 
-from exporter.acting.policy import LoadedPolicy
-from exporter.play.worlds import World
-from signatures.errors import UsageError
+from export_model.exporter.acting.policy import LoadedPolicy
+from export_model.exporter.play.worlds import World
+from export_model.signatures.errors import UsageError
 
 Array = np.ndarray
 #: Episodes that are played at once; more are played in turns.

@@ -31,10 +31,10 @@ from statistics import NormalDist
 import numpy as np
 from msgspec import Struct
 
-from exporter.play.student import t_quantile
-from exporter.verify.plays import CONFIDENCE, DIFFERENT, EQUIVALENT, NOT_DECIDED, Interval
-from exporter.verify.statistics import FALSE_ALARM
-from signatures.errors import UsageError
+from export_model.exporter.play.student import t_quantile
+from export_model.exporter.verify.plays import CONFIDENCE, DIFFERENT, EQUIVALENT, NOT_DECIDED, Interval
+from export_model.exporter.verify.statistics import FALSE_ALARM
+from export_model.signatures.errors import UsageError
 
 #: Of returns, those that tell how far they usually lie apart.
 PERCENTILES = (5, 95)

@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from exporter.play.worlds import MakeWorld, Outcome, View
-from signatures.errors import UsageError, suggestion
-from signatures.roles import Role
-from signatures.spec import PolicySignature, TensorSpec
+from export_model.exporter.play.worlds import MakeWorld, Outcome, View
+from export_model.signatures.errors import UsageError, suggestion
+from export_model.signatures.roles import Role
+from export_model.signatures.spec import PolicySignature, TensorSpec
 
 Array = np.ndarray
 _MASKS = ("action_mask", "action_masks")

@@ -9,30 +9,30 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from converters.files.children.process import RunFailedError
-from converters.formats.bundle.embed import runnable
-from converters.graph.run import run_graph
-from converters.policy.policy import Policy
-from exporter.acting.policy import LoadedPolicy
-from exporter.play.episodes import Episodes, Watch, play_episodes, turn_seed
-from exporter.play.equivalence import Equivalence, equivalence, is_out_of_reach, look_sizes, share_error
-from exporter.play.options import PlayOptions
-from exporter.play.recording import Recorder
-from exporter.play.replay import replay
-from exporter.play.worlds import MakeWorld
-from exporter.verify.asked import Inputs
-from exporter.verify.checks.rollout import rollout
-from exporter.verify.findings import Finding
-from exporter.verify.participants import Participant, PolicyUnderTest
-from exporter.verify.plays import CONFIDENCE, DIFFERENT, EQUIVALENT, NOT_DECIDED
-from exporter.verify.reference import Reference
-from exporter.verify.report import ParityReport
-from exporter.verify.session import Session
-from exporter.verify.trial import Trial
-from exporter.verify.verification import Participants, verify
-from signatures.batches import Arrays, Run
-from signatures.errors import ExportModelError
-from signatures.spec import PolicySignature
+from export_model.converters.files.children.process import RunFailedError
+from export_model.converters.formats.bundle.embed import runnable
+from export_model.converters.graph.run import run_graph
+from export_model.converters.policy.policy import Policy
+from export_model.exporter.acting.policy import LoadedPolicy
+from export_model.exporter.play.episodes import Episodes, Watch, play_episodes, turn_seed
+from export_model.exporter.play.equivalence import Equivalence, equivalence, is_out_of_reach, look_sizes, share_error
+from export_model.exporter.play.options import PlayOptions
+from export_model.exporter.play.recording import Recorder
+from export_model.exporter.play.replay import replay
+from export_model.exporter.play.worlds import MakeWorld
+from export_model.exporter.verify.asked import Inputs
+from export_model.exporter.verify.checks.rollout import rollout
+from export_model.exporter.verify.findings import Finding
+from export_model.exporter.verify.participants import Participant, PolicyUnderTest
+from export_model.exporter.verify.plays import CONFIDENCE, DIFFERENT, EQUIVALENT, NOT_DECIDED
+from export_model.exporter.verify.reference import Reference
+from export_model.exporter.verify.report import ParityReport
+from export_model.exporter.verify.session import Session
+from export_model.exporter.verify.trial import Trial
+from export_model.exporter.verify.verification import Participants, verify
+from export_model.signatures.batches import Arrays, Run
+from export_model.signatures.errors import ExportModelError
+from export_model.signatures.spec import PolicySignature
 
 Progress = Callable[[str], None]
 #: Turns that no first episodes reach: their seeds are those of others.

@@ -6,17 +6,17 @@ from pathlib import Path
 
 import numpy as np
 
-from exporter.acting.loading import load_policy
-from exporter.play.environments import ENVIRONMENTS
-from exporter.play.environments.base import Observation
-from exporter.play.environments.tennis import follow_ball
-from exporter.play.gymnasium_world import gymnasium_maker, own_maker
-from exporter.play.worlds import Decide, MakeWorld, OwnWorld, World, own_scene
-from exporter.serve.scenes import SCENES, other_side
-from signatures.contract import POLICY
-from signatures.errors import UsageError
-from signatures.roles import Role
-from signatures.spec import PolicySignature
+from export_model.exporter.acting.loading import load_policy
+from export_model.exporter.play.environments import ENVIRONMENTS
+from export_model.exporter.play.environments.base import Observation
+from export_model.exporter.play.environments.tennis import follow_ball
+from export_model.exporter.play.gymnasium_world import gymnasium_maker, own_maker
+from export_model.exporter.play.worlds import Decide, MakeWorld, OwnWorld, World, own_scene
+from export_model.exporter.serve.scenes import SCENES, other_side
+from export_model.signatures.contract import POLICY
+from export_model.signatures.errors import UsageError
+from export_model.signatures.roles import Role
+from export_model.signatures.spec import PolicySignature
 
 
 def world_maker(env: str, place: Path, partner: Path | str | None = None) -> MakeWorld:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from msgspec import Struct
 from msgspec.structs import force_setattr
 
-from exporter.acting.generator import MAX_SEED
-from exporter.play.equivalence import LEAST_EPISODES, MOST_EPISODES, Margin, parse_margin
-from signatures.errors import whole
+from export_model.exporter.acting.generator import MAX_SEED
+from export_model.exporter.play.equivalence import LEAST_EPISODES, MOST_EPISODES, Margin, parse_margin
+from export_model.signatures.errors import whole
 
 
 class PlayOptions(Struct, frozen=True):

@@ -9,26 +9,26 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
-from converters.compiler.options import CompileOptions
-from converters.files.children.process import RunFailedError
-from converters.files.folders import scratch_folder
-from converters.formats.bundle.bundle import Bundle
-from converters.formats.source import ReadOptions
-from converters.policy.policy import Policy
-from converters.runtimes.pool import RuntimePool
-from exporter.compare.comparison import CompareOptions, compare_artefacts
-from exporter.export.options import ExportOptions
-from exporter.export.pipeline import export
-from exporter.play.match import Match
-from exporter.play.named import world_maker
-from exporter.play.options import PlayOptions
-from exporter.play.record import keep_record
-from exporter.play.report import PlayReport
-from exporter.play.worlds import MakeWorld
-from exporter.remote.fetching import nearby
-from exporter.verify.options import VerifyOptions
-from signatures.contract import POLICY
-from signatures.errors import UsageError
+from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.files.children.process import RunFailedError
+from export_model.converters.files.folders import scratch_folder
+from export_model.converters.formats.bundle.bundle import Bundle
+from export_model.converters.formats.source import ReadOptions
+from export_model.converters.policy.policy import Policy
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.compare.comparison import CompareOptions, compare_artefacts
+from export_model.exporter.export.options import ExportOptions
+from export_model.exporter.export.pipeline import export
+from export_model.exporter.play.match import Match
+from export_model.exporter.play.named import world_maker
+from export_model.exporter.play.options import PlayOptions
+from export_model.exporter.play.record import keep_record
+from export_model.exporter.play.report import PlayReport
+from export_model.exporter.play.worlds import MakeWorld
+from export_model.exporter.remote.fetching import nearby
+from export_model.exporter.verify.options import VerifyOptions
+from export_model.signatures.contract import POLICY
+from export_model.signatures.errors import UsageError
 
 _LOG = logging.getLogger(__name__)
 

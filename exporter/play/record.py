@@ -6,12 +6,12 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
-from converters.files.fetch import read_bytes
-from converters.formats.bundle import bundle
-from exporter.play.report import PlayReport
-from signatures.contract import PARITY, json_of
-from signatures.errors import BundleError
-from signatures.fields import FieldError
+from export_model.converters.files.fetch import read_bytes
+from export_model.converters.formats.bundle import bundle
+from export_model.exporter.play.report import PlayReport
+from export_model.signatures.contract import PARITY, json_of
+from export_model.signatures.errors import BundleError
+from export_model.signatures.fields import FieldError
 
 _MOST_BYTES = 16 << 20
 

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from exporter.verify.asked import Inputs
-from signatures.batches import Arrays, Run
-from signatures.sampling import Case
-from signatures.spec import PolicySignature
+from export_model.exporter.verify.asked import Inputs
+from export_model.signatures.batches import Arrays, Run
+from export_model.signatures.sampling import Case
+from export_model.signatures.spec import PolicySignature
 
 #: Episodes of which states are kept.
 ROWS = 64

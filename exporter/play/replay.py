@@ -6,13 +6,13 @@ from collections.abc import Iterator, Sequence
 
 from msgspec.structs import replace
 
-from converters.formats.registry import narrows
-from exporter.verify.checks.numbers import largest, plausible, rank
-from exporter.verify.difference import Difference, add_histograms
-from exporter.verify.findings import Finding, Numbers, Shape
-from exporter.verify.participants import Feeds, Participant
-from exporter.verify.trial import Trial
-from signatures.sampling import Case
+from export_model.converters.formats.registry import narrows
+from export_model.exporter.verify.checks.numbers import largest, plausible, rank
+from export_model.exporter.verify.difference import Difference, add_histograms
+from export_model.exporter.verify.findings import Finding, Numbers, Shape
+from export_model.exporter.verify.participants import Feeds, Participant
+from export_model.exporter.verify.trial import Trial
+from export_model.signatures.sampling import Case
 
 #: Steps that are compared before the first difference among them is looked for.
 _TOGETHER = 16

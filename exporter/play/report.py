@@ -8,13 +8,21 @@ from typing import Any
 import numpy as np
 from msgspec import Struct
 
-from exporter.play.episodes import Episodes
-from exporter.play.equivalence import mean_interval, scale_of
-from exporter.play.match import Played
-from exporter.play.options import PlayOptions
-from exporter.tables import table
-from exporter.verify.plays import CONFIDENCE, DIFFERENT, EQUIVALENT, NOT_DECIDED, Interval, Player, PlayRecord
-from exporter.verify.report import ParityReport
+from export_model.exporter.play.episodes import Episodes
+from export_model.exporter.play.equivalence import mean_interval, scale_of
+from export_model.exporter.play.match import Played
+from export_model.exporter.play.options import PlayOptions
+from export_model.exporter.tables import table
+from export_model.exporter.verify.plays import (
+    CONFIDENCE,
+    DIFFERENT,
+    EQUIVALENT,
+    NOT_DECIDED,
+    Interval,
+    Player,
+    PlayRecord,
+)
+from export_model.exporter.verify.report import ParityReport
 
 
 class PlayReport(Struct, frozen=True):

@@ -8,13 +8,13 @@ from typing import Protocol
 import numpy as np
 from msgspec import Struct
 
-from exporter.play.environments import ENVIRONMENTS
-from exporter.play.environments.base import Environment, Observation
-from exporter.play.environments.tennis import BRAINS
-from exporter.serve.scenes import SCENES, Scene
-from signatures.errors import UsageError
-from signatures.roles import Role
-from signatures.spec import PolicySignature
+from export_model.exporter.play.environments import ENVIRONMENTS
+from export_model.exporter.play.environments.base import Environment, Observation
+from export_model.exporter.play.environments.tennis import BRAINS
+from export_model.exporter.serve.scenes import SCENES, Scene
+from export_model.signatures.errors import UsageError
+from export_model.signatures.roles import Role
+from export_model.signatures.spec import PolicySignature
 
 Array = np.ndarray
 

@@ -9,11 +9,11 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
-from converters.files.fetch import path_text
-from converters.files.folders import scratch_folder
-from exporter.remote.filesystem import MAX_FILES, Pace, asking, filesystem, is_http, remote
-from signatures.digest import sha256_hex
-from signatures.errors import ExportModelError, SourceError
+from export_model.converters.files.fetch import path_text
+from export_model.converters.files.folders import scratch_folder
+from export_model.exporter.remote.filesystem import MAX_FILES, Pace, asking, filesystem, is_http, remote
+from export_model.signatures.digest import sha256_hex
+from export_model.signatures.errors import ExportModelError, SourceError
 
 #: Bytes of one source: the largest that is read is one of 2 GiB with its weights beside it.
 MAX_BYTES = 8 << 30

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urljoin
 
-from converters.files.fetch import FETCHED, address_of, fetches, path_text
-from signatures.errors import BundleError, ExportModelError, SourceError, UsageError
+from export_model.converters.files.fetch import FETCHED, address_of, fetches, path_text
+from export_model.signatures.errors import BundleError, ExportModelError, SourceError, UsageError
 
 #: Files of one source, or links of one level of a web server's pages; bytes of these pages.
 MAX_FILES = 4096
@@ -66,7 +66,7 @@ def _manner() -> dict[str, Any]:
     """
     import aiohttp
 
-    from exporter.remote.redirects import guarded_client
+    from export_model.exporter.remote.redirects import guarded_client
 
     timeout = aiohttp.ClientTimeout(total=6 * 3600, sock_connect=30, sock_read=60)
     headers = {"Accept-Encoding": "identity"}

@@ -11,7 +11,7 @@ from __future__ import annotations
 import ipaddress
 from typing import Any
 
-from signatures.errors import SourceError
+from export_model.signatures.errors import SourceError
 
 
 async def guarded_client(**settings: Any) -> Any:

@@ -6,12 +6,12 @@ import contextlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from converters.files.fetch import address_of, fetches, path_text
-from converters.files.folders import scratch_folder
-from converters.formats.bundle import bundle
-from exporter.remote.filesystem import asking, filesystem, is_http, remote
-from signatures.contract import POLICY
-from signatures.errors import BundleError, UsageError
+from export_model.converters.files.fetch import address_of, fetches, path_text
+from export_model.converters.files.folders import scratch_folder
+from export_model.converters.formats.bundle import bundle
+from export_model.exporter.remote.filesystem import asking, filesystem, is_http, remote
+from export_model.signatures.contract import POLICY
+from export_model.signatures.errors import BundleError, UsageError
 
 #: Puts a staged bundle in its place, and says where that is.
 Put = Callable[[Path, str], Path]

@@ -9,11 +9,11 @@ import itertools
 import math
 from collections.abc import Sequence
 
-from exporter.reports.layers import Block
-from exporter.reports.layout import layout
-from exporter.reports.markup import Markup, el, svg
-from exporter.verify.difference import BINS, FIRST, LAST
-from exporter.verify.findings import Finding
+from export_model.exporter.reports.layers import Block
+from export_model.exporter.reports.layout import layout
+from export_model.exporter.reports.markup import Markup, el, svg
+from export_model.exporter.verify.difference import BINS, FIRST, LAST
+from export_model.exporter.verify.findings import Finding
 
 _BAR, _STRIP, _ZERO_GAP = 17.0, 46.0, 18.0
 #: Lines have this many colours; a second round of them is dashed.

@@ -8,16 +8,16 @@ from pathlib import Path
 import numpy as np
 from msgspec import Struct
 
-from converters.files.fetch import path_text
-from converters.formats.bundle.bundle import Bundle
-from converters.graph.nodes import Graph
-from exporter.export.pipeline import ExportResult
-from exporter.reports.markup import Markup
-from exporter.verify.report import ParityReport
-from signatures.contract import Contract
-from signatures.errors import ExportModelError
-from signatures.sampling import draw_cases, draw_rollout
-from signatures.spec import PolicySignature
+from export_model.converters.files.fetch import path_text
+from export_model.converters.formats.bundle.bundle import Bundle
+from export_model.converters.graph.nodes import Graph
+from export_model.exporter.export.pipeline import ExportResult
+from export_model.exporter.reports.markup import Markup
+from export_model.exporter.verify.report import ParityReport
+from export_model.signatures.contract import Contract
+from export_model.signatures.errors import ExportModelError
+from export_model.signatures.sampling import draw_cases, draw_rollout
+from export_model.signatures.spec import PolicySignature
 
 
 class Entry(Struct, frozen=True):

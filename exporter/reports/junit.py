@@ -9,13 +9,13 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Sequence
 
-from converters.formats.registry import FORMATS
-from exporter.reports.entry import Entry
-from exporter.reports.refused import place_of
-from exporter.verify.findings import Failure, Finding
-from exporter.verify.plays import DIFFERENT, NOT_DECIDED, PlayRecord
-from signatures.errors import ExportModelError
-from signatures.fields import printable
+from export_model.converters.formats.registry import FORMATS
+from export_model.exporter.reports.entry import Entry
+from export_model.exporter.reports.refused import place_of
+from export_model.exporter.verify.findings import Failure, Finding
+from export_model.exporter.verify.plays import DIFFERENT, NOT_DECIDED, PlayRecord
+from export_model.signatures.errors import ExportModelError
+from export_model.signatures.fields import printable
 
 
 def junit_xml(entries: Sequence[Entry], refused: Sequence[ExportModelError] = ()) -> bytes:

@@ -11,8 +11,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from msgspec import Struct, field
 
-from converters.graph.nodes import Graph, Node, node_of
-from converters.graph.ops.table import traits
+from export_model.converters.graph.nodes import Graph, Node, node_of
+from export_model.converters.graph.ops.table import traits
 
 #: A box that normalises has no more nodes.
 _NORMALISER = 6

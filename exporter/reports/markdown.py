@@ -5,13 +5,13 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 
-from exporter.reports.entry import Entry
-from exporter.reports.refused import place_of
-from exporter.tables import size_with_original
-from exporter.verify.plays import CONFIDENCE, DIFFERENT, EQUIVALENT, NOT_DECIDED, PlayRecord
-from exporter.verify.report import ParityReport
-from signatures.errors import ExportModelError
-from signatures.fields import printable
+from export_model.exporter.reports.entry import Entry
+from export_model.exporter.reports.refused import place_of
+from export_model.exporter.tables import size_with_original
+from export_model.exporter.verify.plays import CONFIDENCE, DIFFERENT, EQUIVALENT, NOT_DECIDED, PlayRecord
+from export_model.exporter.verify.report import ParityReport
+from export_model.signatures.errors import ExportModelError
+from export_model.signatures.fields import printable
 
 #: What the numbers of the table are.
 _CELLS = "Numbers are the largest difference as a share of what is allowed."

@@ -6,7 +6,7 @@ import html
 from collections.abc import Iterable, Sequence
 from typing import TypeAlias
 
-from signatures.fields import printable
+from export_model.signatures.fields import printable
 
 _VOID = frozenset({"meta", "br", "hr", "wbr"})
 #: What MathJax 2 and 3 leave alone: a notebook reads $…$ as mathematics, which has links of its own.

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from exporter import __version__
-from exporter.reports import sections
-from exporter.reports.entry import Entry
-from exporter.reports.markup import Markup, el
-from exporter.reports.refused import place_of
-from exporter.verify.report import Pair
-from signatures.errors import ExportModelError
+from export_model.exporter import __version__
+from export_model.exporter.reports import sections
+from export_model.exporter.reports.entry import Entry
+from export_model.exporter.reports.markup import Markup, el
+from export_model.exporter.reports.refused import place_of
+from export_model.exporter.verify.report import Pair
+from export_model.signatures.errors import ExportModelError
 
 _PARTS = Path(__file__).parent
 _CHIPS = {

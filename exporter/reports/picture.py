@@ -8,12 +8,12 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from converters.policy.policy import Policy
-from exporter.reports.charts import diagram_parts
-from exporter.reports.layers import Block, blocks_of
-from exporter.reports.markup import Markup, el, svg_file
-from signatures.errors import UsageError
-from signatures.spec import TensorSpec
+from export_model.converters.policy.policy import Policy
+from export_model.exporter.reports.charts import diagram_parts
+from export_model.exporter.reports.layers import Block, blocks_of
+from export_model.exporter.reports.markup import Markup, el, svg_file
+from export_model.signatures.errors import UsageError
+from export_model.signatures.spec import TensorSpec
 
 _MARGIN, _HEAD = 24, 78
 #: More would be no picture.

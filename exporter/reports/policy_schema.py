@@ -1,4 +1,4 @@
-"""policy.schema.json, made of the records that a contract is read into: ``python -m exporter.reports.policy_schema``.
+"""policy.schema.json, made of the records that a contract is read into: ``python -m export_model.exporter.reports.policy_schema``.
 
 msgspec says what may stand in a field, the record's docstring what it is, in a list (``- ``name``: text``) by the names
 that JSON has.
@@ -11,10 +11,10 @@ import re
 from pathlib import Path
 from typing import Any
 
-from signatures.contract import SCHEMA, Code, Distribution, Head, Origin, Preprocess, Tool
-from signatures.fields import Text
-from signatures.labels import Labels
-from signatures.spec import PolicySignature
+from export_model.signatures.contract import SCHEMA, Code, Distribution, Head, Origin, Preprocess, Tool
+from export_model.signatures.fields import Text
+from export_model.signatures.labels import Labels
+from export_model.signatures.spec import PolicySignature
 
 FILE = Path(__file__).with_name("policy.schema.json")
 #: What stands in members that the signature has as any JSON, and that are read apart.

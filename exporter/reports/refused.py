@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from signatures.errors import ExportModelError, RefusedError
+from export_model.signatures.errors import ExportModelError, RefusedError
 
 
 def each_error(errors: Iterable[ExportModelError]) -> list[ExportModelError]:

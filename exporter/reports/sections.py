@@ -7,15 +7,15 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from converters.interfaces.text import loop_lines, tables
-from exporter.reports import charts
-from exporter.reports.entry import Entry
-from exporter.reports.layers import blocks_of
-from exporter.reports.markup import Child, Markup, el
-from exporter.tables import command_text, count_text, size_with_original
-from exporter.verify.findings import Failure, Finding, Rollout
-from exporter.verify.plays import CONFIDENCE
-from signatures.spec import TensorSpec
+from export_model.converters.interfaces.text import loop_lines, tables
+from export_model.exporter.reports import charts
+from export_model.exporter.reports.entry import Entry
+from export_model.exporter.reports.layers import blocks_of
+from export_model.exporter.reports.markup import Child, Markup, el
+from export_model.exporter.tables import command_text, count_text, size_with_original
+from export_model.exporter.verify.findings import Failure, Finding, Rollout
+from export_model.exporter.verify.plays import CONFIDENCE
+from export_model.signatures.spec import TensorSpec
 
 _SHOWN_VALUES = 12
 #: More boxes than this are no picture any more.

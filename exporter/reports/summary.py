@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 
-from converters.formats.registry import WRITTEN
-from exporter.tables import count_text, size_with_original, table
-from exporter.verify.findings import Failure, Finding, Undecided
-from exporter.verify.report import ParityReport
-from exporter.verify.verdict import key_of, missing_runtimes
-from signatures.fields import printable
+from export_model.converters.formats.registry import WRITTEN
+from export_model.exporter.tables import count_text, size_with_original, table
+from export_model.exporter.verify.findings import Failure, Finding, Undecided
+from export_model.exporter.verify.report import ParityReport
+from export_model.exporter.verify.verdict import key_of, missing_runtimes
+from export_model.signatures.fields import printable
 
 
 def parity_table(report: ParityReport) -> str:

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from msgspec import Struct
 
-from exporter.reports.entry import Entry
-from signatures.errors import ExportModelError, UsageError
+from export_model.exporter.reports.entry import Entry
+from export_model.signatures.errors import ExportModelError, UsageError
 
 
 class Documents(Struct, frozen=True):
@@ -23,22 +23,22 @@ class Documents(Struct, frozen=True):
 
 def parity_documents(entries: Callable[[], Sequence[Entry]], refused: Sequence[ExportModelError] = ()) -> Documents:
     """Return what makes reports on verifications, and on what was ``refused``; ``entries`` is called for each."""
-    from exporter.reports.refused import each_error
+    from export_model.exporter.reports.refused import each_error
 
     errors = each_error(refused)
 
     def junit() -> bytes:
-        from exporter.reports.junit import junit_xml
+        from export_model.exporter.reports.junit import junit_xml
 
         return junit_xml(entries(), errors)
 
     def html() -> str:
-        from exporter.reports.page import page
+        from export_model.exporter.reports.page import page
 
         return page(entries(), errors)
 
     def markdown() -> str:
-        from exporter.reports.markdown import markdown_text
+        from export_model.exporter.reports.markdown import markdown_text
 
         return markdown_text(entries(), errors)
 

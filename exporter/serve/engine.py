@@ -10,12 +10,12 @@ from collections.abc import Mapping
 
 from msgspec import Struct
 
-from converters.formats.bundle.bundle import Bundle
-from converters.formats.format import WriteOptions
-from converters.formats.js.writer import write_module
-from converters.graph.nodes import Graph
-from converters.policy.policy import Policy
-from signatures.code import CodeOptions
+from export_model.converters.formats.bundle.bundle import Bundle
+from export_model.converters.formats.format import WriteOptions
+from export_model.converters.formats.js.writer import write_module
+from export_model.converters.graph.nodes import Graph
+from export_model.converters.policy.policy import Policy
+from export_model.signatures.code import CodeOptions
 
 _EXPORTED = re.compile(r"^export (?=class|function|const)", re.M)
 _DEFAULT = re.compile(r"^export default .*;\n", re.M)

@@ -12,14 +12,14 @@ from pathlib import Path
 
 from msgspec import Struct
 
-from converters.formats.bundle.bundle import Bundle, dumps
-from exporter import __version__
-from exporter.export.names import Names
-from exporter.serve.scenes import other_side, scene_of
-from exporter.serve.server import INDEX
-from exporter.serve.site import MADE_BY, PAGE, SITE, assemble, assemble_one_file, preview
-from exporter.tables import count_text
-from signatures.errors import BundleError, ExportModelError
+from export_model.converters.formats.bundle.bundle import Bundle, dumps
+from export_model.exporter import __version__
+from export_model.exporter.export.names import Names
+from export_model.exporter.serve.scenes import other_side, scene_of
+from export_model.exporter.serve.server import INDEX
+from export_model.exporter.serve.site import MADE_BY, PAGE, SITE, assemble, assemble_one_file, preview
+from export_model.exporter.tables import count_text
+from export_model.signatures.errors import BundleError, ExportModelError
 
 STYLE = "gallery.css"
 _CSS = """\

@@ -16,8 +16,8 @@ import re
 from collections.abc import Mapping
 from pathlib import PurePosixPath
 
-from exporter.serve.server import DATA, INDEX
-from signatures.errors import DamagedFileError
+from export_model.exporter.serve.server import DATA, INDEX
+from export_model.signatures.errors import DamagedFileError
 
 _IMPORT = re.compile(r'^import \{([^}]*)\} from "(\.[^"]+)";$', re.M)
 _EXPORT = re.compile(r"^export (?=(?:async )?(?:function|class|const) ([\w$]+))", re.M)

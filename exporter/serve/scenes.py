@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 from msgspec import Struct
 
-from signatures.errors import UsageError
-from signatures.roles import Role
-from signatures.spec import PolicySignature
+from export_model.signatures.errors import UsageError
+from export_model.signatures.roles import Role
+from export_model.signatures.spec import PolicySignature
 
 AUTO, NONE = "auto", "none"
 

@@ -17,13 +17,13 @@ from typing import Any
 
 import numpy as np
 
-from converters.graph.nodes import Graph
-from exporter.verify.difference import floor_log_probs, ties
-from exporter.verify.reference import random_outputs
-from exporter.verify.tolerances import Tolerance, tolerance_for
-from signatures.roles import Role
-from signatures.sampling import FAR_CASES, Case, draw_cases, draw_rollout
-from signatures.spec import PolicySignature
+from export_model.converters.graph.nodes import Graph
+from export_model.exporter.verify.difference import floor_log_probs, ties
+from export_model.exporter.verify.reference import random_outputs
+from export_model.exporter.verify.tolerances import Tolerance, tolerance_for
+from export_model.signatures.roles import Role
+from export_model.signatures.sampling import FAR_CASES, Case, draw_cases, draw_rollout
+from export_model.signatures.spec import PolicySignature
 
 SEED = 0
 _STEPS = 4
@@ -37,7 +37,7 @@ _STORED = {"int64": "int32", "bool": "uint8"}
 
 def golden(signature: PolicySignature, graph: Graph) -> tuple[dict[str, Any], bytes]:
     """golden.json and golden.bin for the policy of ``graph``, which the numpy kernels run."""
-    from converters.graph.run import run_graph
+    from export_model.converters.graph.run import run_graph
 
     drawn = random_outputs(graph, [s.name for s in signature.outputs])
     names = [s.name for s in signature.outputs if s.name not in drawn]

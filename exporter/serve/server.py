@@ -21,7 +21,7 @@ from pathlib import PurePosixPath
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
-from signatures.errors import UsageError
+from export_model.signatures.errors import UsageError
 
 INDEX = "index.html"
 #: Not mimetypes: it asks the system, and Windows' registry may call .js text/plain.

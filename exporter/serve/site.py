@@ -11,19 +11,19 @@ from typing import Any
 
 from msgspec import Struct
 
-import converters.formats.tfjs
-from converters.formats.bundle.bundle import Bundle, dumps, writing
-from converters.formats.bundle.embed import runnable
-from converters.formats.bundle.exchange import exchange, stage
-from converters.formats.registry import FROZEN_GRAPH, ONNX, TFJS, WRITTEN
-from converters.runtimes.javascript.node import INSTALL_TFJS, check_packages, js_home, package_version
-from exporter import __version__
-from exporter.serve.engine import engine_of, makers_module
-from exporter.serve.scenes import AUTO, Scene, other_side, scene_of
-from exporter.serve.selftest import golden
-from exporter.serve.server import DATA, INDEX, TYPES
-from signatures.contract import PARITY, POLICY, json_of
-from signatures.errors import BundleError, RuntimeUnavailableError, UnsupportedOpError, naming
+import export_model.converters.formats.tfjs
+from export_model.converters.formats.bundle.bundle import Bundle, dumps, writing
+from export_model.converters.formats.bundle.embed import runnable
+from export_model.converters.formats.bundle.exchange import exchange, stage
+from export_model.converters.formats.registry import FROZEN_GRAPH, ONNX, TFJS, WRITTEN
+from export_model.converters.runtimes.javascript.node import INSTALL_TFJS, check_packages, js_home, package_version
+from export_model.exporter import __version__
+from export_model.exporter.serve.engine import engine_of, makers_module
+from export_model.exporter.serve.scenes import AUTO, Scene, other_side, scene_of
+from export_model.exporter.serve.selftest import golden
+from export_model.exporter.serve.server import DATA, INDEX, TYPES
+from export_model.signatures.contract import PARITY, POLICY, json_of
+from export_model.signatures.errors import BundleError, RuntimeUnavailableError, UnsupportedOpError, naming
 
 PAGE = Path(__file__).resolve().parent / "page"
 #: Stills of the environments, of ``make pictures``.
@@ -127,7 +127,7 @@ def assemble_one_file(folder: Path, scene: str = AUTO, *, picture: str | None = 
 
     ``picture`` lies beside it, for messengers that show one with a link. Raises as ``assemble``, and DamagedFileError.
     """
-    from exporter.serve.onefile import one_file
+    from export_model.exporter.serve.onefile import one_file
 
     site, said, refused = _content(folder, scene, whole=False)
     if refused is not None:
@@ -213,9 +213,9 @@ def _original(policy: Bundle) -> dict[str, str] | None:
 
     None where the bundle's report does not say that the original ran.
     """
-    from converters.runtimes.pool import INDEPENDENT
-    from exporter.verify.findings import share_text
-    from exporter.verify.verdict import runtime_title
+    from export_model.converters.runtimes.pool import INDEPENDENT
+    from export_model.exporter.verify.findings import share_text
+    from export_model.exporter.verify.verdict import runtime_title
 
     try:
         with (policy.folder / PARITY).open("rb") as file:
@@ -247,7 +247,7 @@ def describe_page(page: bytes, name: str, family: str, acts: bool) -> bytes:
 
 def _asking_at_once(site: Mapping[str, bytes]) -> bytes:
     """index.html, which asks for all modules at once: a browser else finds them import by import, round by round."""
-    from exporter.serve.onefile import modules_of
+    from export_model.exporter.serve.onefile import modules_of
 
     links = "".join(f'<link rel="modulepreload" href="{name}">\n' for name in modules_of(site))
     return site[INDEX].replace(b"</head>", f"{links}</head>".encode())

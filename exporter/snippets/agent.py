@@ -10,10 +10,17 @@ import re
 import textwrap
 from collections.abc import Sequence
 
-from converters.consumers.mlagents.memory import DRAWN_KEPT
-from exporter.snippets.contract import Bundle, branch_lines, class_name, fill_template, number_names, wrap_items
-from signatures.roles import SENSOR_ORDER, Role
-from signatures.spec import TensorSpec
+from export_model.converters.consumers.mlagents.memory import DRAWN_KEPT
+from export_model.exporter.snippets.contract import (
+    Bundle,
+    branch_lines,
+    class_name,
+    fill_template,
+    number_names,
+    wrap_items,
+)
+from export_model.signatures.roles import SENSOR_ORDER, Role
+from export_model.signatures.spec import TensorSpec
 
 
 def agent(bundle: Bundle) -> str:
@@ -83,7 +90,7 @@ def _head(bundle: Bundle, sensors: list[TensorSpec], vector: TensorSpec | None) 
 
 def _model(bundle: Bundle) -> str:
     if bundle.made_for is not None:
-        from converters.consumers.profiles import profile
+        from export_model.converters.consumers.profiles import profile
 
         wanted = profile(bundle.made_for)
         form = next(f for f in wanted.formats if f"{bundle.name}.{f}" in bundle.files)

@@ -14,15 +14,15 @@ from string import Template
 from msgspec import Struct
 from msgspec.structs import replace
 
-from converters.formats.bundle import bundle
-from converters.formats.frozen_graph.reader import read_graph
-from converters.formats.registry import FROZEN_GRAPH
-from converters.interfaces.text import ALL, loop_lines, term_lines
-from signatures.contract import Contract
-from signatures.errors import naming
-from signatures.ids import bounds_text
-from signatures.roles import Role
-from signatures.spec import PolicySignature, TensorSpec
+from export_model.converters.formats.bundle import bundle
+from export_model.converters.formats.frozen_graph.reader import read_graph
+from export_model.converters.formats.registry import FROZEN_GRAPH
+from export_model.converters.interfaces.text import ALL, loop_lines, term_lines
+from export_model.signatures.contract import Contract
+from export_model.signatures.errors import naming
+from export_model.signatures.ids import bounds_text
+from export_model.signatures.roles import Role
+from export_model.signatures.spec import PolicySignature, TensorSpec
 
 #: The frames: a file each, under its own language's name, in the form of Python's string.Template.
 _FRAMES = Path(__file__).resolve().parent / "templates"

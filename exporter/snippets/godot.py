@@ -5,7 +5,7 @@ Source: controller/ai_controller_3d.gd and sync.gd of the plugin: ``get_obs``, `
 
 from __future__ import annotations
 
-from exporter.snippets.contract import Bundle, fill_template
+from export_model.exporter.snippets.contract import Bundle, fill_template
 
 
 def godot(bundle: Bundle) -> str:

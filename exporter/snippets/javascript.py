@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable
 from enum import StrEnum
 
-from exporter.snippets.contract import (
+from export_model.exporter.snippets.contract import (
     ODDS,
     STEPS,
     Bundle,
@@ -21,9 +21,9 @@ from exporter.snippets.contract import (
     meaning,
     string_literal,
 )
-from exporter.snippets.packages import ORT, TFJS, Package
-from signatures.roles import Role
-from signatures.spec import TensorSpec
+from export_model.exporter.snippets.packages import ORT, TFJS, Package
+from export_model.signatures.roles import Role
+from export_model.signatures.spec import TensorSpec
 
 #: What holds a tensor's numbers (float16: their bits, as onnxruntime-web takes them).
 _ARRAYS = {

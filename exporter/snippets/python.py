@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from converters.formats.registry import ONNX, SAVED_MODEL
-from exporter.snippets.contract import (
+from export_model.converters.formats.registry import ONNX, SAVED_MODEL
+from export_model.exporter.snippets.contract import (
     ODDS,
     STEPS,
     Bundle,
@@ -13,8 +13,8 @@ from exporter.snippets.contract import (
     meaning,
     string_literal,
 )
-from signatures.roles import Role
-from signatures.spec import TensorSpec
+from export_model.signatures.roles import Role
+from export_model.signatures.spec import TensorSpec
 
 
 def onnxruntime(bundle: Bundle) -> str:

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from exporter.snippets.agent import component_text, ordered_sensors, script_name, vector_sensor
-from exporter.snippets.contract import Bundle, fill_template, string_literal
-from signatures.roles import Role
-from signatures.spec import TensorSpec
+from export_model.exporter.snippets.agent import component_text, ordered_sensors, script_name, vector_sensor
+from export_model.exporter.snippets.contract import Bundle, fill_template, string_literal
+from export_model.signatures.roles import Role
+from export_model.signatures.spec import TensorSpec
 
 
 def gymnasium(bundle: Bundle) -> str:

@@ -9,11 +9,11 @@ from typing import Any
 
 from msgspec import Struct
 
-from converters.formats.format import Code, Format
-from converters.formats.registry import BARRACUDA, CSHARP, FROZEN_GRAPH, ONNX, SAVED_MODEL, TFJS, WRITTEN
-from exporter.snippets import agent, csharp, godot, javascript, python, recorders, serving, unity
-from exporter.snippets.contract import Bundle, string_literal
-from signatures.errors import BundleError, UsageError
+from export_model.converters.formats.format import Code, Format
+from export_model.converters.formats.registry import BARRACUDA, CSHARP, FROZEN_GRAPH, ONNX, SAVED_MODEL, TFJS, WRITTEN
+from export_model.exporter.snippets import agent, csharp, godot, javascript, python, recorders, serving, unity
+from export_model.exporter.snippets.contract import Bundle, string_literal
+from export_model.signatures.errors import BundleError, UsageError
 
 
 class Target(Struct, frozen=True):
@@ -167,7 +167,7 @@ def snippets(bundle: Bundle, name: str | None = None) -> tuple[list[Snippet], di
 
 def _for_consumer(bundle: Bundle, name: str | None) -> str | None:
     """The target of a word of ``--for``, a profile's too; raises BundleError where the bundle is not for that one."""
-    from converters.consumers.profiles import PROFILES
+    from export_model.converters.consumers.profiles import PROFILES
 
     wanted = next((p for p in PROFILES if name in (p.name, *p.aliases) and name not in {t.name for t in TARGETS}), None)
     if wanted is None:

@@ -11,11 +11,18 @@ import json
 import math
 from typing import Any
 
-from converters.formats.registry import SAVED_MODEL
-from exporter.snippets.contract import Bundle, action_meaning, example_shape, fill_template, meaning, string_literal
-from exporter.snippets.python import play
-from signatures.roles import Role
-from signatures.spec import TensorSpec
+from export_model.converters.formats.registry import SAVED_MODEL
+from export_model.exporter.snippets.contract import (
+    Bundle,
+    action_meaning,
+    example_shape,
+    fill_template,
+    meaning,
+    string_literal,
+)
+from export_model.exporter.snippets.python import play
+from export_model.signatures.roles import Role
+from export_model.signatures.spec import TensorSpec
 
 #: A body of more numbers is made by a command instead of being printed.
 _MOST_NUMBERS = 400

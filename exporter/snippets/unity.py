@@ -11,9 +11,9 @@ from collections.abc import Sequence
 
 from msgspec import Struct
 
-from exporter.snippets.contract import Bundle, branch_lines, number_names
-from signatures.roles import ACTION_SHAPE, IS_CONTINUOUS, MEMORY_SIZE, VERSION_NUMBER, Role
-from signatures.spec import TensorSpec
+from export_model.exporter.snippets.contract import Bundle, branch_lines, number_names
+from export_model.signatures.roles import ACTION_SHAPE, IS_CONTINUOUS, MEMORY_SIZE, VERSION_NUMBER, Role
+from export_model.signatures.spec import TensorSpec
 
 
 class Generation(Struct, frozen=True):

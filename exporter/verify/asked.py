@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from msgspec import Struct
 
-from exporter.verify.difference import Difference
-from exporter.verify.participants import Feeds, Participant
-from signatures.sampling import Case
+from export_model.exporter.verify.difference import Difference
+from export_model.exporter.verify.participants import Feeds, Participant
+from export_model.signatures.sampling import Case
 
 
 class Inputs(Struct, frozen=True):

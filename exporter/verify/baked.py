@@ -6,9 +6,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from converters.interfaces.isaac_lab import RAW_ACTION
-from signatures.interface import Range, Term
-from signatures.spec import PolicySignature
+from export_model.converters.interfaces.isaac_lab import RAW_ACTION
+from export_model.signatures.interface import Range, Term
+from export_model.signatures.spec import PolicySignature
 
 
 def apply_stated(signature: PolicySignature, answers: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

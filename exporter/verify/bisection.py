@@ -15,22 +15,22 @@ from pathlib import Path
 import numpy as np
 from msgspec import Struct
 
-from converters.files.children.process import RunFailedError
-from converters.formats.bundle.embed import runnable
-from converters.formats.frozen_graph.reader import read_graph
-from converters.formats.intermediate_tensors import InnerTensors
-from converters.formats.registry import WRITTEN
-from converters.graph.nodes import Graph, Node
-from converters.graph.ops.samplers import SAMPLERS
-from converters.graph.ops.table import traits
-from converters.graph.run import run_graph
-from converters.runtimes.pool import RuntimePool
-from exporter.verify.difference import Difference, compare
-from exporter.verify.findings import Bisection
-from exporter.verify.inner_tensors import inner_tensors, outputs_read
-from exporter.verify.participants import Feeds, Participant, PolicyUnderTest
-from exporter.verify.tolerances import Tolerance
-from signatures.errors import ExportModelError
+from export_model.converters.files.children.process import RunFailedError
+from export_model.converters.formats.bundle.embed import runnable
+from export_model.converters.formats.frozen_graph.reader import read_graph
+from export_model.converters.formats.intermediate_tensors import InnerTensors
+from export_model.converters.formats.registry import WRITTEN
+from export_model.converters.graph.nodes import Graph, Node
+from export_model.converters.graph.ops.samplers import SAMPLERS
+from export_model.converters.graph.ops.table import traits
+from export_model.converters.graph.run import run_graph
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.verify.difference import Difference, compare
+from export_model.exporter.verify.findings import Bisection
+from export_model.exporter.verify.inner_tensors import inner_tensors, outputs_read
+from export_model.exporter.verify.participants import Feeds, Participant, PolicyUnderTest
+from export_model.exporter.verify.tolerances import Tolerance
+from export_model.signatures.errors import ExportModelError
 
 #: Bytes of expected values that one fetch may ask for: what a runtime holds and sends at a time.
 FETCH_BYTES = 64 << 20

@@ -10,13 +10,13 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
-from converters.formats.bundle.embed import runnable
-from converters.graph.nodes import Graph, Node
-from converters.graph.ops.table import traits
-from converters.graph.run import run_graph
-from exporter.verify.participants import Feeds
-from exporter.verify.tolerances import Tolerance
-from signatures.errors import GraphError
+from export_model.converters.formats.bundle.embed import runnable
+from export_model.converters.graph.nodes import Graph, Node
+from export_model.converters.graph.ops.table import traits
+from export_model.converters.graph.run import run_graph
+from export_model.exporter.verify.participants import Feeds
+from export_model.exporter.verify.tolerances import Tolerance
+from export_model.signatures.errors import GraphError
 
 Arrays = dict[str, np.ndarray]
 #: A tensor of scores, for inputs → how far rounding moves it, element by element.

@@ -16,24 +16,24 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from converters.compiler.passes.noise import tensor_of
-from converters.files import tensorflow_messages as schema
-from converters.files.children.process import LoadedModel
-from converters.files.external_data import Detached
-from converters.formats.bundle.embed import runnable
-from converters.formats.frozen_graph.encode import encode
-from converters.formats.intermediate_tensors import InnerTensors, RunAll, Sampler
-from converters.graph.editor import Editor
-from converters.graph.nodes import Graph, Node, TensorShape
-from converters.graph.ops.samplers import KINDS
-from converters.graph.shapes import infer_types
-from converters.graph.types import static_shape
-from converters.runtimes.pool import RuntimePool
-from exporter.verify.inner_tensors import inner_tensors
-from exporter.verify.participants import Feeds, Participant, PolicyUnderTest, Run
-from signatures.batches import batches_of, put_together, rows_of
-from signatures.roles import Role
-from signatures.spec import TensorSpec
+from export_model.converters.compiler.passes.noise import tensor_of
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.files.children.process import LoadedModel
+from export_model.converters.files.external_data import Detached
+from export_model.converters.formats.bundle.embed import runnable
+from export_model.converters.formats.frozen_graph.encode import encode
+from export_model.converters.formats.intermediate_tensors import InnerTensors, RunAll, Sampler
+from export_model.converters.graph.editor import Editor
+from export_model.converters.graph.nodes import Graph, Node, TensorShape
+from export_model.converters.graph.ops.samplers import KINDS
+from export_model.converters.graph.shapes import infer_types
+from export_model.converters.graph.types import static_shape
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.verify.inner_tensors import inner_tensors
+from export_model.exporter.verify.participants import Feeds, Participant, PolicyUnderTest, Run
+from export_model.signatures.batches import batches_of, put_together, rows_of
+from export_model.signatures.roles import Role
+from export_model.signatures.spec import TensorSpec
 
 Arrays = dict[str, np.ndarray]
 #: Log-probabilities below that of one in 10⁹ say "never": ML-Agents leaves masked actions about 10⁻¹⁰.

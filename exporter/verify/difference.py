@@ -9,8 +9,8 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from exporter.verify.excuses import BOTH_NAN, CHAOS, ROUNDING, Excuse, Forgiven
-from exporter.verify.tolerances import Tolerance
+from export_model.exporter.verify.excuses import BOTH_NAN, CHAOS, ROUNDING, Excuse, Forgiven
+from export_model.exporter.verify.tolerances import Tolerance
 
 #: Integer dtypes that TensorFlow.js has not: int32 in place of int64 there is listed, not a failure.
 NARROWED = {("int64", "int32")}

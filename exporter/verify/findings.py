@@ -8,12 +8,12 @@ from typing import Any, ClassVar, TypeVar
 from msgspec import Struct
 from msgspec.structs import replace
 
-from converters.files.children.process import RunFailedError
-from exporter.verify.difference import by_decade
-from exporter.verify.excuses import Forgiven, forgiven_text
-from exporter.verify.statistics import FALSE_ALARM
-from exporter.verify.tolerances import Tolerance
-from signatures.fields import Record, explicit_default
+from export_model.converters.files.children.process import RunFailedError
+from export_model.exporter.verify.difference import by_decade
+from export_model.exporter.verify.excuses import Forgiven, forgiven_text
+from export_model.exporter.verify.statistics import FALSE_ALARM
+from export_model.exporter.verify.tolerances import Tolerance
+from export_model.signatures.fields import Record, explicit_default
 
 
 class Bisection(Record, frozen=True):

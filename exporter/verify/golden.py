@@ -13,13 +13,13 @@ from pathlib import Path
 import numpy as np
 from msgspec import Struct
 
-from converters.files.fetch import read_bytes
-from converters.files.zip_archives import ZIP_ERRORS, entry_of, open_archive
-from exporter.verify.npy import read_array
-from signatures.errors import SourceError, UsageError
-from signatures.roles import Role
-from signatures.sampling import Case
-from signatures.spec import PolicySignature, TensorSpec
+from export_model.converters.files.fetch import read_bytes
+from export_model.converters.files.zip_archives import ZIP_ERRORS, entry_of, open_archive
+from export_model.exporter.verify.npy import read_array
+from export_model.signatures.errors import SourceError, UsageError
+from export_model.signatures.roles import Role
+from export_model.signatures.sampling import Case
+from export_model.signatures.spec import PolicySignature, TensorSpec
 
 #: Rows that are run at once; a recording may hold thousands.
 _ROWS = 64

@@ -8,11 +8,11 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
-from converters.formats.intermediate_tensors import InnerTensors, Loaded, View, no_tensors
-from converters.formats.registry import FROZEN_GRAPH, WRITTEN
-from converters.graph.nodes import ref, split_ref
-from converters.runtimes.pool import RuntimePool
-from exporter.verify.participants import Participant
+from export_model.converters.formats.intermediate_tensors import InnerTensors, Loaded, View, no_tensors
+from export_model.converters.formats.registry import FROZEN_GRAPH, WRITTEN
+from export_model.converters.graph.nodes import ref, split_ref
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.verify.participants import Participant
 
 
 @contextmanager

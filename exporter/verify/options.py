@@ -9,8 +9,8 @@ from pathlib import Path
 from msgspec import Struct, field
 from msgspec.structs import force_setattr
 
-from exporter.verify.tolerances import Tolerance, ToleranceRule
-from signatures.errors import UsageError, whole
+from export_model.exporter.verify.tolerances import Tolerance, ToleranceRule
+from export_model.signatures.errors import UsageError, whole
 
 
 class VerifyOptions(Struct, frozen=True):

@@ -12,11 +12,11 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from converters.compiler.passes.noise import laid_out
-from converters.files.children.process import LoadedModel, RunFailedError
-from signatures.memories import SourcePart, join_memory, split_memory
-from signatures.roles import Role
-from signatures.spec import PolicySignature, SourceMap, TensorSpec
+from export_model.converters.compiler.passes.noise import laid_out
+from export_model.converters.files.children.process import LoadedModel, RunFailedError
+from export_model.signatures.memories import SourcePart, join_memory, split_memory
+from export_model.signatures.roles import Role
+from export_model.signatures.spec import PolicySignature, SourceMap, TensorSpec
 
 Arrays = Mapping[str, np.ndarray]
 #: Rows that a source which takes one number of them only may ask for.

@@ -10,21 +10,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from msgspec import Struct, field
 
-from converters.consumers.named_files import answered_outputs
-from converters.files.children.process import LoadedModel, RunFailedError
-from converters.formats.registry import FROZEN_GRAPH, WRITTEN
-from converters.formats.source import OriginalRun
-from converters.graph.nodes import Graph
-from converters.runtimes.pool import RuntimePool
-from converters.runtimes.registry import RUNTIMES
-from exporter.verify.findings import Finding
-from signatures.batches import batches_of, put_together, rows_of
-from signatures.code import CodeOptions
-from signatures.spec import PolicySignature, SourceMap
+from export_model.converters.consumers.named_files import answered_outputs
+from export_model.converters.files.children.process import LoadedModel, RunFailedError
+from export_model.converters.formats.registry import FROZEN_GRAPH, WRITTEN
+from export_model.converters.formats.source import OriginalRun
+from export_model.converters.graph.nodes import Graph
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.converters.runtimes.registry import RUNTIMES
+from export_model.exporter.verify.findings import Finding
+from export_model.signatures.batches import batches_of, put_together, rows_of
+from export_model.signatures.code import CodeOptions
+from export_model.signatures.spec import PolicySignature, SourceMap
 
 if TYPE_CHECKING:
-    from converters.policy.policy import Policy
-    from exporter.verify.reference import Reference
+    from export_model.converters.policy.policy import Policy
+    from export_model.exporter.verify.reference import Reference
 if not TYPE_CHECKING:  # what asks a record for its signature looks the name up
     Policy = Any
 
@@ -72,7 +72,7 @@ class PolicyUnderTest(Struct, frozen=True, kw_only=True):
 
 def write_reference(policy: Policy, folder: Path, name: str = "reference") -> Path:
     """Write the policy as the numpy kernels run it; return the file. Raises OSError."""
-    from converters.formats.frozen_graph.writer import frozen_graph
+    from export_model.converters.formats.frozen_graph.writer import frozen_graph
 
     folder.mkdir(exist_ok=True)
     file = folder / FROZEN_GRAPH.main_of(name)
@@ -100,7 +100,7 @@ def policy_under_test(
     ``reference`` is what the numpy kernels run; without one it is the artefact that is a frozen graph, else one that is
     written to ``scratch``. ``files`` are the bundle's own, where the artefacts are copies. Raises OSError.
     """
-    from converters.formats.saved_model.writer import signatures_of
+    from export_model.converters.formats.saved_model.writer import signatures_of
 
     reference = reference or artefacts.get(FROZEN_GRAPH.key) or write_reference(policy, scratch)
     return PolicyUnderTest(

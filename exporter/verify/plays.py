@@ -10,10 +10,10 @@ from typing import Annotated, Any
 
 from msgspec import Meta, Struct
 
-from converters.files.fetch import read_bytes
-from signatures.contract import PARITY, json_of
-from signatures.errors import BundleError
-from signatures.fields import Blank, Count, FieldError, Real, Text, one_of, read
+from export_model.converters.files.fetch import read_bytes
+from export_model.signatures.contract import PARITY, json_of
+from export_model.signatures.errors import BundleError
+from export_model.signatures.fields import Blank, Count, FieldError, Real, Text, one_of, read
 
 EQUIVALENT, DIFFERENT, NOT_DECIDED = "EQUIVALENT", "DIFFERENT", "NOT DECIDED"
 VERDICTS = (EQUIVALENT, DIFFERENT, NOT_DECIDED)

@@ -9,17 +9,17 @@ from pathlib import Path
 
 import numpy as np
 
-from converters.consumers.named_files import answered_outputs
-from converters.files.children.process import LoadedModel, RunFailedError
-from converters.formats.registry import FROZEN_GRAPH, WRITTEN
-from converters.graph.nodes import Graph
-from converters.graph.ops.samplers import SAMPLERS
-from converters.runtimes.pool import RuntimePool
-from exporter.verify.baked import apply_stated
-from exporter.verify.findings import Undecided, undecided_reference
-from exporter.verify.original import Original
-from exporter.verify.participants import Participant, PolicyUnderTest
-from signatures.roles import Role
+from export_model.converters.consumers.named_files import answered_outputs
+from export_model.converters.files.children.process import LoadedModel, RunFailedError
+from export_model.converters.formats.registry import FROZEN_GRAPH, WRITTEN
+from export_model.converters.graph.nodes import Graph
+from export_model.converters.graph.ops.samplers import SAMPLERS
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.verify.baked import apply_stated
+from export_model.exporter.verify.findings import Undecided, undecided_reference
+from export_model.exporter.verify.original import Original
+from export_model.exporter.verify.participants import Participant, PolicyUnderTest
+from export_model.signatures.roles import Role
 
 Arrays = Mapping[str, np.ndarray]
 Answers = list[dict[str, np.ndarray]]

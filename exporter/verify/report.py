@@ -8,10 +8,10 @@ from typing import Any
 from msgspec import Struct, field
 from msgspec.structs import replace
 
-from exporter.tables import count_text
-from exporter.verify.findings import Accepted, Failure, Finding, Played, Shape, Undecided
-from exporter.verify.plays import PlayRecord
-from exporter.verify.verdict import unchecked_formats, verdict
+from export_model.exporter.tables import count_text
+from export_model.exporter.verify.findings import Accepted, Failure, Finding, Played, Shape, Undecided
+from export_model.exporter.verify.plays import PlayRecord
+from export_model.exporter.verify.verdict import unchecked_formats, verdict
 
 
 def _badness(c: Finding) -> tuple[bool, bool, float]:
@@ -93,7 +93,7 @@ class ParityReport(Struct, frozen=True):
         return f"<ParityReport {self.policy!r} {self.verdict}: {compared}{self._worst}>"
 
     def _repr_html_(self) -> str:
-        from exporter.reports.markup import notebook
+        from export_model.exporter.reports.markup import notebook
 
         rows = [(p.format, p.runtime, f"{'✓' if p.passed else '✗'} {p.word}", p.worst_text) for p in self.pairs]
         return notebook(f"{self.policy}: {self.sentence}", (("format", "runtime", "verdict", "of tolerance"), rows))

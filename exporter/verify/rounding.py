@@ -14,15 +14,15 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from msgspec import Struct
 
-from converters.files.children.process import LoadedModel, RunFailedError
-from converters.graph.jitter import Jitter
-from converters.graph.nodes import Graph
-from converters.graph.run import run_graph
-from converters.runtimes.registry import RUNTIMES
-from exporter.verify.difference import steps
-from exporter.verify.participants import Feeds
-from exporter.verify.tolerances import Tolerance
-from signatures.sampling import Case
+from export_model.converters.files.children.process import LoadedModel, RunFailedError
+from export_model.converters.graph.jitter import Jitter
+from export_model.converters.graph.nodes import Graph
+from export_model.converters.graph.run import run_graph
+from export_model.converters.runtimes.registry import RUNTIMES
+from export_model.exporter.verify.difference import steps
+from export_model.exporter.verify.participants import Feeds
+from export_model.exporter.verify.tolerances import Tolerance
+from export_model.signatures.sampling import Case
 
 FACTOR = 4
 RUNS = 6

@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 
 from msgspec import Struct, field
 
-from converters.runtimes.pool import RuntimePool
-from converters.runtimes.registry import RuntimeInfo
-from exporter.verify.options import VerifyOptions
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.converters.runtimes.registry import RuntimeInfo
+from export_model.exporter.verify.options import VerifyOptions
 
 
 class Session(Struct, frozen=True):

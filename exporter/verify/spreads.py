@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from exporter.verify.difference import SHARE, spread
+from export_model.exporter.verify.difference import SHARE, spread
 
 
 class Spreads:

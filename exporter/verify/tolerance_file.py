@@ -17,11 +17,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from converters.formats.registry import WRITTEN
-from converters.runtimes.registry import RUNTIMES
-from exporter.options_file import read_options
-from exporter.verify.tolerances import Tolerance, ToleranceRule
-from signatures.errors import UsageError
+from export_model.converters.formats.registry import WRITTEN
+from export_model.converters.runtimes.registry import RUNTIMES
+from export_model.exporter.options_file import read_options
+from export_model.exporter.verify.tolerances import Tolerance, ToleranceRule
+from export_model.signatures.errors import UsageError
 
 _KEYS = frozenset({"policy", "format", "runtime", "output", "atol", "rtol", "reason"})
 #: What a float holds; a number of TOML or JSON may have any number of digits.

@@ -6,8 +6,8 @@ from collections.abc import Collection, Mapping, Sequence
 
 from msgspec import Struct
 
-from signatures.errors import UsageError
-from signatures.spec import PolicySignature
+from export_model.signatures.errors import UsageError
+from export_model.signatures.spec import PolicySignature
 
 #: |a − b| ≤ ATOL + RTOL·|b| for every element.
 ATOL = RTOL = 1e-5

@@ -11,17 +11,17 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from converters.files.folders import scratch_folder
-from converters.formats.bundle.embed import runnable
-from converters.formats.registry import narrows
-from converters.graph.nodes import Graph
-from converters.graph.run import run_graph
-from converters.runtimes.pool import RuntimePool
-from exporter.verify.asked import Inputs, Question
-from exporter.verify.bisection import Bisector
-from exporter.verify.choices import Choices, broken_ties
-from exporter.verify.cut import CutPolicy, cut_policy
-from exporter.verify.difference import (
+from export_model.converters.files.folders import scratch_folder
+from export_model.converters.formats.bundle.embed import runnable
+from export_model.converters.formats.registry import narrows
+from export_model.converters.graph.nodes import Graph
+from export_model.converters.graph.run import run_graph
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.verify.asked import Inputs, Question
+from export_model.exporter.verify.bisection import Bisector
+from export_model.exporter.verify.choices import Choices, broken_ties
+from export_model.exporter.verify.cut import CutPolicy, cut_policy
+from export_model.exporter.verify.difference import (
     ONE_SIDED,
     OPEN,
     SHARE,
@@ -33,7 +33,7 @@ from exporter.verify.difference import (
     near_best,
     score_bounds,
 )
-from exporter.verify.excuses import (
+from export_model.exporter.verify.excuses import (
     CHAOS,
     NAN_FROM_ZERO,
     NEVER,
@@ -44,17 +44,17 @@ from exporter.verify.excuses import (
     Excuse,
     Forgiven,
 )
-from exporter.verify.findings import Bisection, Finding, Shape
-from exporter.verify.golden import Golden, read_golden
-from exporter.verify.options import VerifyOptions
-from exporter.verify.participants import Feeds, Participant, PolicyUnderTest
-from exporter.verify.reference import Reference
-from exporter.verify.rounding import Hull, Rounding, hull
-from exporter.verify.spreads import Spreads
-from exporter.verify.tolerances import Tolerance, tolerance_by_rules, tolerance_for
-from exporter.verify.work import Allowances
-from signatures.roles import Role
-from signatures.sampling import FAR_CASES, HUGE_BATCH, Case, draw_cases, draw_rollout, unknown_ids
+from export_model.exporter.verify.findings import Bisection, Finding, Shape
+from export_model.exporter.verify.golden import Golden, read_golden
+from export_model.exporter.verify.options import VerifyOptions
+from export_model.exporter.verify.participants import Feeds, Participant, PolicyUnderTest
+from export_model.exporter.verify.reference import Reference
+from export_model.exporter.verify.rounding import Hull, Rounding, hull
+from export_model.exporter.verify.spreads import Spreads
+from export_model.exporter.verify.tolerances import Tolerance, tolerance_by_rules, tolerance_for
+from export_model.exporter.verify.work import Allowances
+from export_model.signatures.roles import Role
+from export_model.signatures.sampling import FAR_CASES, HUGE_BATCH, Case, draw_cases, draw_rollout, unknown_ids
 
 Arrays = dict[str, np.ndarray]
 Hulls = Mapping[str, Hull]

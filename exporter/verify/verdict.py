@@ -5,14 +5,24 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from converters.formats.registry import KERNELS, WRITTEN
-from converters.runtimes.pool import INDEPENDENT
-from exporter.tables import count_text
-from exporter.verify.excuses import add_forgiven
-from exporter.verify.findings import Accepted, Decisions, Draws, Failure, Finding, Played, Size, Stated, Undecided
+from export_model.converters.formats.registry import KERNELS, WRITTEN
+from export_model.converters.runtimes.pool import INDEPENDENT
+from export_model.exporter.tables import count_text
+from export_model.exporter.verify.excuses import add_forgiven
+from export_model.exporter.verify.findings import (
+    Accepted,
+    Decisions,
+    Draws,
+    Failure,
+    Finding,
+    Played,
+    Size,
+    Stated,
+    Undecided,
+)
 
 if TYPE_CHECKING:
-    from exporter.verify.report import ParityReport
+    from export_model.exporter.verify.report import ParityReport
 
 #: What is held against the reference and is no format that was written.
 _APART = ("reference", "golden", "source", "weights")
@@ -178,7 +188,7 @@ def _checkers(says: Sequence[Finding]) -> str:
 
 def _loaders(names: Sequence[str]) -> str:
     """The loaders outside Unity among those that were asked."""
-    from converters.consumers.robots.loaders import LOADERS
+    from export_model.converters.consumers.robots.loaders import LOADERS
 
     return " and ".join(f"the loader rules of {name}" for name in names if name in LOADERS)
 

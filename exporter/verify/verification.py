@@ -7,19 +7,19 @@ from contextlib import closing
 
 from msgspec.structs import replace
 
-from converters.files.children.process import LoadedModel, RunFailedError
-from converters.runtimes.pool import INDEPENDENT
-from exporter.verify.asked import Inputs
-from exporter.verify.checks.agents import agents
-from exporter.verify.checks.baked import check_baked
-from exporter.verify.checks.consumer import consumers
-from exporter.verify.checks.draws import draws
-from exporter.verify.checks.finite import check_defined
-from exporter.verify.checks.numbers import check_recording, numbers
-from exporter.verify.checks.rollout import rollout
-from exporter.verify.checks.size import check_budget, sizes
-from exporter.verify.findings import Finding, failure, undecided_finding, undecided_reference
-from exporter.verify.participants import (
+from export_model.converters.files.children.process import LoadedModel, RunFailedError
+from export_model.converters.runtimes.pool import INDEPENDENT
+from export_model.exporter.verify.asked import Inputs
+from export_model.exporter.verify.checks.agents import agents
+from export_model.exporter.verify.checks.baked import check_baked
+from export_model.exporter.verify.checks.consumer import consumers
+from export_model.exporter.verify.checks.draws import draws
+from export_model.exporter.verify.checks.finite import check_defined
+from export_model.exporter.verify.checks.numbers import check_recording, numbers
+from export_model.exporter.verify.checks.rollout import rollout
+from export_model.exporter.verify.checks.size import check_budget, sizes
+from export_model.exporter.verify.findings import Finding, failure, undecided_finding, undecided_reference
+from export_model.exporter.verify.participants import (
     Failure,
     Participant,
     PolicyUnderTest,
@@ -28,11 +28,11 @@ from exporter.verify.participants import (
     participants_of,
     unfit_reason,
 )
-from exporter.verify.reference import Reference
-from exporter.verify.report import ParityReport
-from exporter.verify.session import Session
-from exporter.verify.trial import Trial
-from exporter.verify.verdict import key_of, required_reason
+from export_model.exporter.verify.reference import Reference
+from export_model.exporter.verify.report import ParityReport
+from export_model.exporter.verify.session import Session
+from export_model.exporter.verify.trial import Trial
+from export_model.exporter.verify.verdict import key_of, required_reason
 
 #: Who takes part beside the reference: given the numpy reference and where failures go.
 Participants = Callable[[LoadedModel, Failure], Iterable[Participant]]

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 
-from converters.formats.bundle.embed import runnable
-from converters.graph.nodes import Graph, ref
-from converters.graph.ops.table import traits
-from converters.graph.shapes import infer_types
-from converters.graph.types import TensorType
-from converters.runtimes.registry import RUNTIMES
-from exporter.verify.participants import Participant
+from export_model.converters.formats.bundle.embed import runnable
+from export_model.converters.graph.nodes import Graph, ref
+from export_model.converters.graph.ops.table import traits
+from export_model.converters.graph.shapes import infer_types
+from export_model.converters.graph.types import TensorType
+from export_model.converters.runtimes.registry import RUNTIMES
+from export_model.exporter.verify.participants import Participant
 
 #: What one policy may take in one runtime, about.
 SECONDS = 20

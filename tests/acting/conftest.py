@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.export.pipeline import ExportOptions, export
 from fixtures import path as fixture
 from tests.acting.bundles import Bundles
 from tests.acting.snippet_bundles import export_all

@@ -7,11 +7,11 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
-from converters.formats.registry import DEFAULTS
-from exporter import export_model
-from exporter.export.pipeline import ExportOptions, export
-from exporter.snippets.contract import Bundle, read_bundle
-from exporter.snippets.registry import snippets
+from export_model.converters.formats.registry import DEFAULTS
+from export_model.exporter import export_model
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.snippets.contract import Bundle, read_bundle
+from export_model.exporter.snippets.registry import snippets
 from fixtures import path as fixture
 
 KINDS = ("continuous", "discrete", "sampled", "recurrent", "visual", "twobrains")

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from converters.runtimes.javascript.node import js_home, node_executable
+from export_model.converters.runtimes.javascript.node import js_home, node_executable
 from tests.acting.test_page_snippets import resolved
 from tests.commands import ROOT
 
@@ -25,7 +25,7 @@ def test_its_blocks_run(tmp_path: Path) -> None:
     (tmp_path / "fixtures").symlink_to(ROOT / "fixtures")
     tool = tmp_path / "bin" / "export-model"
     tool.parent.mkdir()
-    tool.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m exporter "$@"\n')
+    tool.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m export_model "$@"\n')
     tool.chmod(0o755)
     path = f"{tool.parent}{os.pathsep}{os.environ['PATH']}"
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "PATH": path}

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.runtimes.csharp import tools
-from converters.runtimes.javascript.node import node_executable
-from exporter.snippets.csharp import _draws
-from exporter.verify.statistics import FALSE_ALARM, fit
+from export_model.converters.runtimes.csharp import tools
+from export_model.converters.runtimes.javascript.node import node_executable
+from export_model.exporter.snippets.csharp import _draws
+from export_model.exporter.verify.statistics import FALSE_ALARM, fit
 from tests.acting.snippet_bundles import bundle_of, code_of
 
 COUNT, BRANCHES = 4096, (3, 2, 4)

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from exporter.acting.generator import MAX_SEED, Generator, likeliest, philox
-from exporter.verify.statistics import FALSE_ALARM, fit
-from signatures.errors import UsageError
+from export_model.exporter.acting.generator import MAX_SEED, Generator, likeliest, philox
+from export_model.exporter.verify.statistics import FALSE_ALARM, fit
+from export_model.signatures.errors import UsageError
 
 
 @pytest.mark.parametrize(

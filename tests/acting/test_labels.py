@@ -10,13 +10,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from converters.compiler.options import CompileOptions
-from exporter import export_model
-from exporter.export.pipeline import ExportOptions, export
-from exporter.export.sources import read_source
+from export_model.converters.compiler.options import CompileOptions
+from export_model.exporter import export_model
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.errors import DamagedFileError, UsageError
+from export_model.signatures.labels import parse_labels, remaining
 from fixtures import path as fixture
-from signatures.errors import DamagedFileError, UsageError
-from signatures.labels import parse_labels, remaining
 from tests.commands import export_model as run
 
 DISCRETE: dict[str, Any] = {

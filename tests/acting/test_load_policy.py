@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from onnx import helper, numpy_helper
 
-from exporter import export_model, load_policy
-from exporter.acting.policy import LoadedPolicy
-from exporter.verify.statistics import FALSE_ALARM, fit
+from export_model.exporter import export_model, load_policy
+from export_model.exporter.acting.policy import LoadedPolicy
+from export_model.exporter.verify.statistics import FALSE_ALARM, fit
+from export_model.signatures.errors import BundleError, RuntimeUnavailableError, UsageError
+from export_model.signatures.roles import Role
+from export_model.signatures.sampling import draw_cases
+from export_model.signatures.spec import PolicySignature, TensorSpec
 from fixtures import path as fixture
-from signatures.errors import BundleError, RuntimeUnavailableError, UsageError
-from signatures.roles import Role
-from signatures.sampling import draw_cases
-from signatures.spec import PolicySignature, TensorSpec
 from tests.acting.bundles import Bundles
 
 NAMES = ("continuous", "discrete", "sampled", "recurrent", "visual")

@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.runtimes.javascript.node import js_home, node_executable
-from exporter import load_policy
-from exporter.snippets.packages import CDN, PACKAGES, TFJS, Package
+from export_model.converters.runtimes.javascript.node import js_home, node_executable
+from export_model.exporter import load_policy
+from export_model.exporter.snippets.packages import CDN, PACKAGES, TFJS, Package
 from tests.acting.snippet_bundles import NAMES, code_of
 from tests.commands import ROOT
 

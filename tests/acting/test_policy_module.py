@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.runtimes.javascript.node import js_home, node_executable
-from converters.runtimes.registry import available_runtimes
-from exporter import load_policy
-from exporter.acting.generator import Generator
-from exporter.acting.policy import Decision, LoadedPolicy
-from signatures.roles import Role
+from export_model.converters.runtimes.javascript.node import js_home, node_executable
+from export_model.converters.runtimes.registry import available_runtimes
+from export_model.exporter import load_policy
+from export_model.exporter.acting.generator import Generator
+from export_model.exporter.acting.policy import Decision, LoadedPolicy
+from export_model.signatures.roles import Role
 from tests.acting.bundles import Bundles
 from tests.acting.test_load_policy import NAMES, observed
 

@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.runtimes.csharp import tools
-from exporter import load_policy
-from exporter.acting.policy import LoadedPolicy
-from exporter.export.pipeline import ExportOptions, export
-from exporter.logs.check import check_log
-from exporter.snippets.contract import read_bundle
-from exporter.snippets.registry import snippets
-from signatures.roles import Role
+from export_model.converters.runtimes.csharp import tools
+from export_model.exporter import load_policy
+from export_model.exporter.acting.policy import LoadedPolicy
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.logs.check import check_log
+from export_model.exporter.snippets.contract import read_bundle
+from export_model.exporter.snippets.registry import snippets
+from export_model.signatures.roles import Role
 from tests.commands import ROOT
 
 TRAINED = ROOT / "fixtures" / "trained"

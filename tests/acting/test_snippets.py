@@ -16,15 +16,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.formats.registry import DEFAULTS
-from exporter import export_model, load_policy
-from exporter.acting.policy import LoadedPolicy
-from exporter.export.pipeline import ExportOptions, export
-from exporter.snippets.contract import read_bundle
-from exporter.snippets.registry import TARGETS, snippets
+from export_model.converters.formats.registry import DEFAULTS
+from export_model.exporter import export_model, load_policy
+from export_model.exporter.acting.policy import LoadedPolicy
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.snippets.contract import read_bundle
+from export_model.exporter.snippets.registry import TARGETS, snippets
+from export_model.signatures.errors import ExportModelError
+from export_model.signatures.roles import Role
 from fixtures import path as fixture
-from signatures.errors import ExportModelError
-from signatures.roles import Role
 from tests.acting.snippet_bundles import NAMES, bundle_of, code_of
 from tests.commands import ROOT
 from tests.commands import export_model as run

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from exporter import export_model
-from exporter.snippets.contract import class_name, identifier, read_bundle, wrap_items
-from exporter.snippets.registry import snippets
+from export_model.exporter import export_model
+from export_model.exporter.snippets.contract import class_name, identifier, read_bundle, wrap_items
+from export_model.exporter.snippets.registry import snippets
 from fixtures import path as fixture
 from tests.commands import export_model as run
 from tests.commands import is_refused

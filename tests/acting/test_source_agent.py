@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from converters.runtimes.csharp import tools
-from exporter.export.pipeline import ExportOptions, export
-from exporter.snippets.contract import read_bundle
-from exporter.snippets.registry import snippets
+from export_model.converters.runtimes.csharp import tools
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.snippets.contract import read_bundle
+from export_model.exporter.snippets.registry import snippets
 from fixtures import FIXTURES, path
 
 #: What of ML-Agents' C# interface an agent calls; no more than names and types.

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from converters.consumers.named_files import artifact_of
-from converters.consumers.unity.checker import check_file
-from converters.consumers.unity.consumers import CONSUMERS
-from converters.consumers.unity.settings import Brain, sensors_of
-from converters.formats.format import WriteOptions
-from converters.formats.registry import WRITTEN
-from converters.policy.policy import Policy
-from signatures.roles import Role
+from export_model.converters.consumers.named_files import artifact_of
+from export_model.converters.consumers.unity.checker import check_file
+from export_model.converters.consumers.unity.consumers import CONSUMERS
+from export_model.converters.consumers.unity.settings import Brain, sensors_of
+from export_model.converters.formats.format import WriteOptions
+from export_model.converters.formats.registry import WRITTEN
+from export_model.converters.policy.policy import Policy
+from export_model.signatures.roles import Role
 
 _MEMORY = "Models from com.unity.ml-agents 1.x that use recurrent neural networks are not supported"
 

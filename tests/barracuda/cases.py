@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from converters.formats.barracuda.format import NnModel
+from export_model.converters.formats.barracuda.format import NnModel
 from tests.barracuda.nn_files import Maker
 
 Array = np.ndarray

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from converters.formats.barracuda.format import Dataset, Layer, NnInput, NnMemory, NnModel, Trailer
+from export_model.converters.formats.barracuda.format import Dataset, Layer, NnInput, NnMemory, NnModel, Trailer
 
 Array = np.ndarray
 

@@ -7,14 +7,14 @@ from collections.abc import Mapping
 import numpy as np
 from msgspec.structs import replace
 
-from converters.consumers.mlagents.version2 import dress_nn
-from converters.formats.barracuda.format import NnModel
-from converters.formats.barracuda.lower import policy_model
-from converters.graph.nodes import Graph, TensorShape
-from converters.graph.run import run_graph
-from converters.policy.policy import Policy
-from signatures.roles import ACTION_NAMES, Role
-from signatures.spec import PolicySignature, TensorSpec
+from export_model.converters.consumers.mlagents.version2 import dress_nn
+from export_model.converters.formats.barracuda.format import NnModel
+from export_model.converters.formats.barracuda.lower import policy_model
+from export_model.converters.graph.nodes import Graph, TensorShape
+from export_model.converters.graph.run import run_graph
+from export_model.converters.policy.policy import Policy
+from export_model.signatures.roles import ACTION_NAMES, Role
+from export_model.signatures.spec import PolicySignature, TensorSpec
 from tests.barracuda.reference import evaluate
 from tests.graph.samples import Sample
 

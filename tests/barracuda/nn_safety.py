@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from converters.formats.barracuda.format import NnModel
-from converters.graph.ops.barracuda.vocabulary import Activation, LayerType
+from export_model.converters.formats.barracuda.format import NnModel
+from export_model.converters.graph.ops.barracuda.vocabulary import Activation, LayerType
 
 #: Layers that Barracuda 1.0 has and no later version computes otherwise.
 SAFE = {
@@ -59,7 +59,7 @@ def assert_safe(model: NnModel) -> None:
 
 def _result(kind: int, layer: object, shapes: list[tuple[int, ...]]) -> tuple[int, ...]:
     """The shape of a layer's result; asserts what the versions ask of its inputs."""
-    from converters.formats.barracuda.format import Layer
+    from export_model.converters.formats.barracuda.format import Layer
 
     assert isinstance(layer, Layer)
     x = shapes[0]
@@ -123,7 +123,7 @@ def _result(kind: int, layer: object, shapes: list[tuple[int, ...]]) -> tuple[in
 
 
 def _window(layer: object, x: tuple[int, ...]) -> tuple[int, ...]:
-    from converters.formats.barracuda.format import Layer
+    from export_model.converters.formats.barracuda.format import Layer
 
     assert isinstance(layer, Layer)
     across, down = layer.stride

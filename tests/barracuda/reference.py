@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from converters.formats.barracuda.format import Layer, NnModel
+from export_model.converters.formats.barracuda.format import Layer, NnModel
 
 Array = np.ndarray
 

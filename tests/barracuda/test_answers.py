@@ -10,22 +10,22 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from converters.compiler.options import CompileOptions
-from converters.consumers.mlagents.own_names import NnPolicy, answered_outputs
-from converters.consumers.named_files import artifact_of
-from converters.formats.barracuda.format import parse
-from converters.formats.barracuda.writer import contract_of, encode
-from converters.formats.format import WriteOptions
-from converters.formats.registry import DEFAULTS, WRITTEN
-from converters.graph.run import run_graph
-from converters.runtimes.pool import RuntimePool
-from exporter.export.again import verify_folder
-from exporter.export.pipeline import ExportOptions, export
-from exporter.reports.summary import failure_lines
-from exporter.verify.tolerances import Tolerance, tolerance_for
-from signatures.contract import EMBEDDED
-from signatures.errors import BundleError, DamagedFileError
-from signatures.roles import Role
+from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.consumers.mlagents.own_names import NnPolicy, answered_outputs
+from export_model.converters.consumers.named_files import artifact_of
+from export_model.converters.formats.barracuda.format import parse
+from export_model.converters.formats.barracuda.writer import contract_of, encode
+from export_model.converters.formats.format import WriteOptions
+from export_model.converters.formats.registry import DEFAULTS, WRITTEN
+from export_model.converters.graph.run import run_graph
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.export.again import verify_folder
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.reports.summary import failure_lines
+from export_model.exporter.verify.tolerances import Tolerance, tolerance_for
+from export_model.signatures.contract import EMBEDDED
+from export_model.signatures.errors import BundleError, DamagedFileError
+from export_model.signatures.roles import Role
 from tests.barracuda.conftest import SHARED, params
 from tests.barracuda.nn_running import fed, some
 from tests.barracuda.reference import evaluate
@@ -103,7 +103,7 @@ def test_a_nn_whose_numbers_or_contract_were_changed_is_found(tmp_path: Path, po
     content = json.loads((result.folder / "policy.json").read_text())
 
     def put(data: bytes) -> None:
-        from signatures.digest import sha256_hex
+        from export_model.signatures.digest import sha256_hex
 
         file.write_bytes(data)
         content["files"]["continuous.nn"] = {"sha256": sha256_hex(data), "bytes": len(data)}

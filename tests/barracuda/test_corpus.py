@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.formats.barracuda.format import parse
-from converters.formats.format import WriteOptions
-from converters.formats.registry import WRITTEN
-from converters.graph.run import run_graph
-from exporter.export.sources import read_source
-from signatures.roles import Role
+from export_model.converters.formats.barracuda.format import parse
+from export_model.converters.formats.format import WriteOptions
+from export_model.converters.formats.registry import WRITTEN
+from export_model.converters.graph.run import run_graph
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.roles import Role
 from tests.barracuda.conftest import SHARED, params, public_files
 
 pytestmark = pytest.mark.corpus

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from converters.formats.barracuda.format import NnModel, Trailer, parse
-from converters.formats.barracuda.writer import encode
+from export_model.converters.formats.barracuda.format import NnModel, Trailer, parse
+from export_model.converters.formats.barracuda.writer import encode
 from tests.barracuda.conftest import SHARED
 from tests.barracuda.nn_files import write_nn
 from tests.barracuda.test_format import PAIRS, assert_same, models

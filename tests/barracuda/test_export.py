@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.formats.format import WriteOptions
-from converters.formats.registry import WRITTEN
-from converters.runtimes.pool import RuntimePool
-from exporter.export.pipeline import ExportOptions, export
-from exporter.reports.summary import failure_lines
-from exporter.verify.options import VerifyOptions
+from export_model.converters.formats.format import WriteOptions
+from export_model.converters.formats.registry import WRITTEN
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.reports.summary import failure_lines
+from export_model.exporter.verify.options import VerifyOptions
 from tests import known
 from tests.barracuda.cases import Case, all_cases
 from tests.barracuda.conftest import BROKEN, genuine_files, params, public_files

@@ -12,9 +12,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import fields, replace
 
-from converters.formats.barracuda.format import VERSIONS, Dataset, Layer, NnInput, NnMemory, NnModel, Trailer, parse
-from converters.formats.barracuda.graph import to_graph
-from signatures.errors import DamagedFileError, ExportModelError
+from export_model.converters.formats.barracuda.format import (
+    VERSIONS,
+    Dataset,
+    Layer,
+    NnInput,
+    NnMemory,
+    NnModel,
+    Trailer,
+    parse,
+)
+from export_model.converters.formats.barracuda.graph import to_graph
+from export_model.signatures.errors import DamagedFileError, ExportModelError
 from tests.barracuda.cases import Case, all_cases
 from tests.barracuda.conftest import public_files
 from tests.barracuda.nn_files import Maker, write_nn

@@ -7,20 +7,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.compiler.compile import compile_graph
-from converters.compiler.options import CompileOptions
-from converters.compiler.passes.normalise import normalise
-from converters.files.fetch import Fetched
-from converters.formats.barracuda.format import NnModel, Trailer, parse
-from converters.formats.barracuda.graph import to_graph
-from converters.formats.barracuda.source import read
-from converters.formats.source import ReadOptions
-from converters.graph.nodes import Graph, TensorShape
-from converters.graph.ops.samplers import reseed
-from converters.graph.run import run_graph
-from converters.policy.policy import Policy
-from signatures.errors import DamagedFileError, SignatureError
-from signatures.roles import Role
+from export_model.converters.compiler.compile import compile_graph
+from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.compiler.passes.normalise import normalise
+from export_model.converters.files.fetch import Fetched
+from export_model.converters.formats.barracuda.format import NnModel, Trailer, parse
+from export_model.converters.formats.barracuda.graph import to_graph
+from export_model.converters.formats.barracuda.source import read
+from export_model.converters.formats.source import ReadOptions
+from export_model.converters.graph.nodes import Graph, TensorShape
+from export_model.converters.graph.ops.samplers import reseed
+from export_model.converters.graph.run import run_graph
+from export_model.converters.policy.policy import Policy
+from export_model.signatures.errors import DamagedFileError, SignatureError
+from export_model.signatures.roles import Role
 from tests.barracuda.nn_files import Maker, write_nn
 from tests.barracuda.reference import evaluate
 

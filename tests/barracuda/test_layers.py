@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from converters.compiler.compile import compile_graph
-from converters.formats.barracuda.format import parse
-from converters.formats.barracuda.graph import to_graph
-from converters.graph.run import run_graph
-from converters.graph.shapes import infer_types
-from converters.graph.types import static_shape
-from converters.policy.policy import Policy
+from export_model.converters.compiler.compile import compile_graph
+from export_model.converters.formats.barracuda.format import parse
+from export_model.converters.formats.barracuda.graph import to_graph
+from export_model.converters.graph.run import run_graph
+from export_model.converters.graph.shapes import infer_types
+from export_model.converters.graph.types import static_shape
+from export_model.converters.policy.policy import Policy
 from tests.barracuda.cases import Case, all_cases
 from tests.barracuda.nn_files import write_nn
 from tests.barracuda.reference import evaluate

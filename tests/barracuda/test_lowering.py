@@ -7,10 +7,10 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from converters.graph.ops.table import TABLE
-from converters.graph.run import run_graph
-from signatures.errors import UnsupportedOpError
-from signatures.roles import Role
+from export_model.converters.graph.ops.table import TABLE
+from export_model.converters.graph.run import run_graph
+from export_model.signatures.errors import UnsupportedOpError
+from export_model.signatures.roles import Role
 from tests.barracuda.cases import Case, all_cases
 from tests.barracuda.nn_running import action_model, action_of, as_policy, some
 from tests.barracuda.nn_safety import assert_safe

@@ -7,11 +7,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from converters.compiler.compile import compile_graph
-from converters.formats.barracuda.format import Trailer, parse
-from converters.formats.barracuda.graph import to_graph
-from converters.graph.ops.barracuda.vocabulary import LayerType, layer_label
-from signatures.errors import DamagedFileError, ExportModelError, GraphError, UnsupportedOpError
+from export_model.converters.compiler.compile import compile_graph
+from export_model.converters.formats.barracuda.format import Trailer, parse
+from export_model.converters.formats.barracuda.graph import to_graph
+from export_model.converters.graph.ops.barracuda.vocabulary import LayerType, layer_label
+from export_model.signatures.errors import DamagedFileError, ExportModelError, GraphError, UnsupportedOpError
 from tests.barracuda.nn_files import Maker, write_nn
 
 X = "vector_observation"

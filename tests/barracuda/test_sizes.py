@@ -8,10 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from converters.compiler.compile import compile_graph
-from converters.formats.frozen_graph.reader import read_graph
-from converters.policy.policy import Policy
-from signatures.errors import UnsupportedOpError
+from export_model.converters.compiler.compile import compile_graph
+from export_model.converters.formats.frozen_graph.reader import read_graph
+from export_model.converters.policy.policy import Policy
+from export_model.signatures.errors import UnsupportedOpError
 from tests.barracuda.nn_running import nn_model
 from tests.handmade import NodeDef, constant, graph_bytes, node, placeholder
 

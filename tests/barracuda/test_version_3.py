@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.consumers.profiles import profile
-from converters.formats.barracuda.format import parse
-from converters.graph.ops.barracuda.vocabulary import LayerType
-from signatures.roles import Role
+from export_model.converters.consumers.profiles import profile
+from export_model.converters.formats.barracuda.format import parse
+from export_model.converters.graph.ops.barracuda.vocabulary import LayerType
+from export_model.signatures.roles import Role
 from tests.barracuda.conftest import params
 from tests.corpus.conftest import genuine_cases
 from tests.corpus.test_goldens import Golden, rows

@@ -15,21 +15,21 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from converters.compiler.options import CompileOptions
-from converters.consumers.named_files import artifact_of
-from converters.formats.barracuda.format import NnModel, parse
-from converters.formats.format import WriteOptions
-from converters.formats.registry import WRITTEN
-from converters.graph.nodes import Graph, Node, TensorShape
-from converters.graph.ops.barracuda.vocabulary import LayerType
-from converters.graph.run import run_graph
-from converters.graph.types import FLOAT32
-from converters.policy.policy import Policy
-from exporter.export.sources import read_source
-from signatures.contract import EMBEDDED
-from signatures.errors import ProfileError, UnsupportedOpError
-from signatures.roles import ACTION_NAMES, Role
-from signatures.spec import Memory, PolicySignature, TensorSpec
+from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.consumers.named_files import artifact_of
+from export_model.converters.formats.barracuda.format import NnModel, parse
+from export_model.converters.formats.format import WriteOptions
+from export_model.converters.formats.registry import WRITTEN
+from export_model.converters.graph.nodes import Graph, Node, TensorShape
+from export_model.converters.graph.ops.barracuda.vocabulary import LayerType
+from export_model.converters.graph.run import run_graph
+from export_model.converters.graph.types import FLOAT32
+from export_model.converters.policy.policy import Policy
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.contract import EMBEDDED
+from export_model.signatures.errors import ProfileError, UnsupportedOpError
+from export_model.signatures.roles import ACTION_NAMES, Role
+from export_model.signatures.spec import Memory, PolicySignature, TensorSpec
 from tests import known
 from tests.barracuda.accepted import assert_accepted
 from tests.barracuda.nn_running import answered, base_name, fed, some, wanted

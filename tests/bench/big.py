@@ -28,7 +28,7 @@ def export_of(kind: str, megabytes: float, verify: str, scratch: Path) -> tuple[
     made = [sys.executable, "-m", "tests.bench.big_policies", kind, str(megabytes), str(source)]
     measure(made, environment())
     try:
-        command = [sys.executable, "-m", "exporter", str(source), "-o", str(out), "--verify", verify]
+        command = [sys.executable, "-m", "export_model", str(source), "-o", str(out), "--verify", verify]
         cost = measure(command, environment())
         return sum(f.stat().st_size for f in scratch.glob("policy.onnx*")), cost
     finally:

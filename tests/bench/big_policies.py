@@ -34,7 +34,7 @@ def layers(megabytes: float) -> Iterator[tuple[np.ndarray, np.ndarray]]:
 
 def frozen(megabytes: float, path: Path) -> None:
     """A frozen graph."""
-    from converters.files import tensorflow_messages as schema
+    from export_model.converters.files import tensorflow_messages as schema
     from tests.handmade import constant, node, placeholder
 
     graph = schema.GraphDef()

@@ -18,12 +18,12 @@ from typing import Any
 
 import numpy as np
 
-from converters.formats.programs.members import header_of
-from exporter.export.options import ExportOptions
-from exporter.export.pipeline import export
+from export_model.converters.formats.programs.members import header_of
+from export_model.exporter.export.options import ExportOptions
+from export_model.exporter.export.pipeline import export
+from export_model.signatures.code import CodeOptions
+from export_model.signatures.errors import ExportModelError
 from fixtures import path
-from signatures.code import CodeOptions
-from signatures.errors import ExportModelError
 from tests import known
 from tests.bench.programs import ROOT
 

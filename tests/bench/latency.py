@@ -78,7 +78,7 @@ def main() -> int:
 
 def made(policy: str, peers: Peers, scratch: Path) -> tuple[Side, Side]:
     """Our files and theirs."""
-    from exporter import export_model
+    from export_model.exporter import export_model
 
     source = ROOT / "fixtures" / f"{policy.replace('loops', 'recurrent')}.bytes"
     (bundle,) = export_model(source, scratch, verify="none")
@@ -101,7 +101,7 @@ def made(policy: str, peers: Peers, scratch: Path) -> tuple[Side, Side]:
 
 
 def _placeholders(source: Path) -> list[str]:
-    from converters.files import tensorflow_messages as schema
+    from export_model.converters.files import tensorflow_messages as schema
 
     message = schema.GraphDef()
     message.ParseFromString(source.read_bytes())
@@ -149,7 +149,7 @@ def _call(side: Side, batch: int) -> Callable[[], object]:
 
 def in_tfjs(backend: str, sides: tuple[Side, Side], batch: int, rounds: int) -> list[list[float]]:
     """The smallest and the median time of each side, in one Node or one page."""
-    from converters.runtimes.javascript.browser import chromium_executable
+    from export_model.converters.runtimes.javascript.browser import chromium_executable
 
     script = Path(__file__).with_suffix(".mjs")
     command = ["node", script, JS / "tfjs_node.mjs", JS, backend, batch, rounds]

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.export.pipeline import ExportOptions, export
 from fixtures import path
 
 POLICIES = ("continuous", "discrete", "recurrent", "visual")

@@ -11,12 +11,12 @@ import sys
 import tempfile
 from pathlib import Path
 
-from converters.formats.c.text import C
-from converters.graph.ops.loops.base import Applied, Given
-from converters.graph.ops.loops.own_math import OWN
-from converters.graph.printer import Printer
-from converters.graph.types import FLOAT32
-from converters.runtimes.c import compiler
+from export_model.converters.formats.c.text import C
+from export_model.converters.graph.ops.loops.base import Applied, Given
+from export_model.converters.graph.ops.loops.own_math import OWN
+from export_model.converters.graph.printer import Printer
+from export_model.converters.graph.types import FLOAT32
+from export_model.converters.runtimes.c import compiler
 
 #: What is left out for a function: where its entry says so.
 _WHERE = {

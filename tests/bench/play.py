@@ -19,13 +19,13 @@ from pathlib import Path
 
 import numpy as np
 
-from exporter import export_model
-from exporter.acting.loading import load_policy
-from exporter.play.options import PlayOptions
-from exporter.play.play import play_policy
-from exporter.tables import table
+from export_model.exporter import export_model
+from export_model.exporter.acting.loading import load_policy
+from export_model.exporter.play.options import PlayOptions
+from export_model.exporter.play.play import play_policy
+from export_model.exporter.tables import table
+from export_model.signatures.sampling import draw_typical
 from fixtures import trained
-from signatures.sampling import draw_typical
 
 EPISODES, STEPS, AGENTS = 200, 100_000, 500
 TARGET, LOG_TARGET = 20.0, 10.0
@@ -87,7 +87,7 @@ def measure_logs(folder: Path, names: Sequence[str] = LOGGED, steps: int = STEPS
         for fault, factor in (("none", 1.0), ("degrees", 180 / np.pi)):
             path = folder / "run.npz"
             write_log(folder / name, path, steps=steps, factor=factor)
-            command = [sys.executable, "-m", "exporter", "verify", str(folder / name), "--log", str(path)]
+            command = [sys.executable, "-m", "export_model", "verify", str(folder / name), "--log", str(path)]
             before, begun = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
             done = subprocess.run(command, capture_output=True, check=False)
             after = resource.getrusage(resource.RUSAGE_CHILDREN)

@@ -22,10 +22,10 @@ from pathlib import Path
 
 import numpy as np
 
-from converters.formats.programs.members import header_of
-from converters.runtimes.c import compiler
-from converters.runtimes.csharp import tools
-from exporter.export.pipeline import ExportOptions, export
+from export_model.converters.formats.programs.members import header_of
+from export_model.converters.runtimes.c import compiler
+from export_model.converters.runtimes.csharp import tools
+from export_model.exporter.export.pipeline import ExportOptions, export
 from fixtures import path
 from tests.programs import sanitize
 

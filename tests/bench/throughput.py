@@ -24,7 +24,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from exporter.fleet.sources import sources_in
+from export_model.exporter.fleet.sources import sources_in
 from tests.bench.plot import Line, plot
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -95,7 +95,18 @@ def measured(sources: Sequence[Path], verify: str, jobs: int, scratch: Path) -> 
     out, listed = scratch / "out", scratch / "sources.txt"
     shutil.rmtree(out, ignore_errors=True)
     listed.write_text("".join(f"{p}\n" for p in sources))
-    command = [sys.executable, "-m", "exporter", str(listed), "-o", str(out), "--verify", verify, "--jobs", str(jobs)]
+    command = [
+        sys.executable,
+        "-m",
+        "export_model",
+        str(listed),
+        "-o",
+        str(out),
+        "--verify",
+        verify,
+        "--jobs",
+        str(jobs),
+    ]
     with tempfile.TemporaryFile() as said:
         start = time.perf_counter()
         process = subprocess.Popen(command, cwd=ROOT, stdin=subprocess.DEVNULL, stdout=said, stderr=said)

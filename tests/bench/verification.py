@@ -39,7 +39,7 @@ class Verification:
 def installed_runtimes() -> list[str]:
     """The runtimes of this machine, browsers apart. Asked in another process: this one has to stay small."""
     program = (
-        "import json; from converters.runtimes.registry import RUNTIMES;"
+        "import json; from export_model.converters.runtimes.registry import RUNTIMES;"
         "print(json.dumps([r.name for r in RUNTIMES if r.taken_by == 'auto' and r.find().installed]))"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
@@ -49,7 +49,7 @@ def installed_runtimes() -> list[str]:
 
 def run_verification(folder: Path, rounds: int = ROUNDS) -> Verification:
     """Export the policy into ``folder`` and measure; both commands run once before that, for the files' cache."""
-    export_model, names = [sys.executable, "-m", "exporter"], installed_runtimes()
+    export_model, names = [sys.executable, "-m", "export_model"], installed_runtimes()
     env = environment()
     measure([*export_model, str(POLICY), "-o", str(folder), "--verify", "none"], env)
     verify = [*export_model, "verify", str(folder / POLICY.stem), "--runtimes", ",".join(names)]

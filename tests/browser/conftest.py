@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from converters.files.children.process import RuntimeProcess
-from converters.runtimes.pool import RuntimePool
-from converters.runtimes.registry import available_runtimes
+from export_model.converters.files.children.process import RuntimeProcess
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.converters.runtimes.registry import available_runtimes
 
 TFJS = ("tfjs-cpu@chromium", "tfjs-wasm@chromium", "tfjs-webgl")
 ONNX = ("onnxruntime-web@chromium",)

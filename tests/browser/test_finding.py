@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from converters.runtimes.base import RuntimeInfo
-from converters.runtimes.javascript import browser, node
-from converters.runtimes.javascript.browser import (
+from export_model.converters.runtimes.base import RuntimeInfo
+from export_model.converters.runtimes.javascript import browser, node
+from export_model.converters.runtimes.javascript.browser import (
     CHROMIUM_VARIABLE,
     RUNTIMES,
     chromium_executable,
 )
-from signatures.errors import RuntimeUnavailableError
+from export_model.signatures.errors import RuntimeUnavailableError
 
 WEBGL, WASM = (next(r for r in RUNTIMES if r.name == name) for name in ("tfjs-webgl", "tfjs-wasm@chromium"))
 Program = Callable[[str], Path]

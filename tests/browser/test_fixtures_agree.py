@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.runtimes.pool import RuntimePool
-from converters.runtimes.registry import available_runtimes
-from exporter.export.again import verify_folder
-from exporter.export.pipeline import ExportOptions, export
-from exporter.reports.summary import failure_lines
-from exporter.verify.options import VerifyOptions
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.converters.runtimes.registry import available_runtimes
+from export_model.exporter.export.again import verify_folder
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.reports.summary import failure_lines
+from export_model.exporter.verify.options import VerifyOptions
 from fixtures import FIXTURES
 from fixtures import path as fixture
 from tests.browser.conftest import BROWSERS, ONNX, TFJS
@@ -77,7 +77,7 @@ def spoil(folder: Path) -> None:
 def test_a_bundle_is_verified_again_in_a_browser_and_a_wrong_weight_is_found(
     tmp_path: Path, browsers: RuntimePool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("exporter.export.again.RuntimePool", lambda: contextlib.nullcontext(browsers))
+    monkeypatch.setattr("export_model.exporter.export.again.RuntimePool", lambda: contextlib.nullcontext(browsers))
     options = ExportOptions(tmp_path, ("bytes", "tfjs"), verify="none")
     (result,) = export([fixture("recurrent")], options)
     wanted = ["tfjs-wasm@chromium"]
@@ -87,7 +87,9 @@ def test_a_bundle_is_verified_again_in_a_browser_and_a_wrong_weight_is_found(
     assert any(len(c.drift) == PARITY.steps for c in report.comparisons if c.runtime in wanted)
 
     spoil(result.folder / "tfjs")
-    monkeypatch.setattr("converters.formats.bundle.bundle.Bundle.verify_hashes", lambda bundle, wanted=None: None)
+    monkeypatch.setattr(
+        "export_model.converters.formats.bundle.bundle.Bundle.verify_hashes", lambda bundle, wanted=None: None
+    )
     report = verify_folder(result.folder, runtimes=wanted, options=PARITY)
     assert report.passed is False
     assert {c.runtime for c in report.comparisons if not c.passed} == set(wanted)

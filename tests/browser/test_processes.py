@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.files.children.process import RunFailedError, RuntimeProcess
-from converters.runtimes.javascript import RUNTIMES
-from converters.runtimes.javascript.node import JS_SOURCE, js_home, node_executable
-from signatures.errors import RuntimeUnavailableError
+from export_model.converters.files.children.process import RunFailedError, RuntimeProcess
+from export_model.converters.runtimes.javascript import RUNTIMES
+from export_model.converters.runtimes.javascript.node import JS_SOURCE, js_home, node_executable
+from export_model.signatures.errors import RuntimeUnavailableError
 from tests.runtimes.graph_models import batch, twins, twins_by_numpy
 
 pytestmark = [

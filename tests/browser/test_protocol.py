@@ -11,8 +11,8 @@ import onnx
 import pytest
 from onnx import TensorProto, helper
 
-from converters.files.children.process import RunFailedError, RuntimeProcess
-from converters.runtimes.javascript.node import JS_SOURCE
+from export_model.converters.files.children.process import RunFailedError, RuntimeProcess
+from export_model.converters.runtimes.javascript.node import JS_SOURCE
 from tests.runtimes.graph_models import CHOICE_FEEDS, batch, choice, info, node, placeholder, twins, twins_by_numpy
 from tests.runtimes.graph_models import write_model as write_tfjs
 

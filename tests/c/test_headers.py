@@ -11,25 +11,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.files.children import confinement
-from converters.files.children.bounded import run_bounded
-from converters.files.children.environment import readable_places
-from converters.files.children.process import RunFailedError
-from converters.formats.format import WriteOptions
-from converters.formats.programs.members import answers, header_of
-from converters.formats.registry import WRITTEN
-from converters.graph.language import comment
-from converters.graph.nodes import Graph, Node, TensorShape
-from converters.graph.types import FLOAT32, INT32
-from converters.runtimes.c import COMPILERS, compiler
-from converters.runtimes.c.child import FLAGS
-from converters.runtimes.pool import RuntimePool
-from converters.runtimes.registry import available_runtimes
-from exporter.export.pipeline import ExportOptions, export
-from exporter.export.sources import read_source
-from exporter.reports.summary import failure_lines
+from export_model.converters.files.children import confinement
+from export_model.converters.files.children.bounded import run_bounded
+from export_model.converters.files.children.environment import readable_places
+from export_model.converters.files.children.process import RunFailedError
+from export_model.converters.formats.format import WriteOptions
+from export_model.converters.formats.programs.members import answers, header_of
+from export_model.converters.formats.registry import WRITTEN
+from export_model.converters.graph.language import comment
+from export_model.converters.graph.nodes import Graph, Node, TensorShape
+from export_model.converters.graph.types import FLOAT32, INT32
+from export_model.converters.runtimes.c import COMPILERS, compiler
+from export_model.converters.runtimes.c.child import FLAGS
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.converters.runtimes.registry import available_runtimes
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.export.sources import read_source
+from export_model.exporter.reports.summary import failure_lines
+from export_model.signatures.errors import UnsupportedOpError
 from fixtures import FIXTURES, path
-from signatures.errors import UnsupportedOpError
 from tests import known
 from tests.conftest import Chosen
 from tests.graph.harness import Runtimes, policy_of

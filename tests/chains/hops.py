@@ -11,18 +11,18 @@ from typing import Any
 import numpy as np
 from msgspec.structs import replace
 
-from converters.compiler.options import CompileOptions
-from converters.formats.registry import WRITTEN
-from converters.graph.run import run_graph
-from converters.policy.policy import Policy
-from converters.runtimes.pool import RuntimePool
-from exporter.export.pipeline import ExportOptions, ExportResult, export
-from exporter.verify.difference import compare, floor_log_probs
-from exporter.verify.tolerances import Tolerance, tolerance_for
-from signatures.contract import safe_name
-from signatures.roles import Role
-from signatures.sampling import draw_cases
-from signatures.spec import PolicySignature
+from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.formats.registry import WRITTEN
+from export_model.converters.graph.run import run_graph
+from export_model.converters.policy.policy import Policy
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.export.pipeline import ExportOptions, ExportResult, export
+from export_model.exporter.verify.difference import compare, floor_log_probs
+from export_model.exporter.verify.tolerances import Tolerance, tolerance_for
+from export_model.signatures.contract import safe_name
+from export_model.signatures.roles import Role
+from export_model.signatures.sampling import draw_cases
+from export_model.signatures.spec import PolicySignature
 from tests.chains.starts import Start
 
 #: What a hop gives to the next one: one format's artefact, or the bundle's folder.

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 import fixtures
-from signatures.roles import Role
+from export_model.signatures.roles import Role
 from tests.barracuda.conftest import BROKEN
 from tests.barracuda.nn_files import write_nn
 from tests.barracuda.test_graph import two_lstms

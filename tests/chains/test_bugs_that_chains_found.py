@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.compiler.options import CompileOptions
-from converters.files import tensorflow_messages as schema
-from exporter.export.sources import read_source
-from signatures.roles import Role
+from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.roles import Role
 from tests.chains.hops import FORMS, Hop, exported, told, walk
 from tests.chains.starts import OWN
 

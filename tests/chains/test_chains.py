@@ -15,7 +15,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from converters.runtimes.pool import RuntimePool
+from export_model.converters.runtimes.pool import RuntimePool
 from tests.chains.hops import FORMS, Hop, assert_runs_alike, told, walk
 from tests.chains.starts import GENUINE, OWN, Start
 from tests.conftest import FULL

@@ -10,9 +10,9 @@ from hypothesis import HealthCheck, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from converters.files import tensorflow_messages as schema
-from converters.formats.checkpoint.tensor_bundle import Checkpoint, slice_key
-from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError, SourceError
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.formats.checkpoint.tensor_bundle import Checkpoint, slice_key
+from export_model.signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError, SourceError
 from tests.checkpoint.writing import bundle, table
 from tests.conftest import examples
 

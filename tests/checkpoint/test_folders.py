@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.files.fetch import Fetched
-from converters.formats.recognise import recognise_path
-from converters.formats.source import ReadOptions
-from exporter.export.pipeline import ExportOptions, export
-from exporter.export.sources import read_source
+from export_model.converters.files.fetch import Fetched
+from export_model.converters.formats.recognise import recognise_path
+from export_model.converters.formats.source import ReadOptions
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.errors import ExportModelError, NotAPolicyError, SourceError, UsageError
 from fixtures import path as fixture
-from signatures.errors import ExportModelError, NotAPolicyError, SourceError, UsageError
 from tests.checkpoint.test_source import OBSERVATION, answer, run_of
 from tests.checkpoint.writing import bundle, expected, policy
 

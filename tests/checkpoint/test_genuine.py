@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.compiler.options import CompileOptions
-from converters.graph.run import run_graph
-from converters.runtimes.pool import RuntimePool
-from exporter.export.pipeline import ExportOptions, export
-from exporter.export.sources import read_source
-from exporter.reports.summary import failure_lines
-from signatures.roles import Role
-from signatures.sampling import draw_cases
+from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.graph.run import run_graph
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.export.sources import read_source
+from export_model.exporter.reports.summary import failure_lines
+from export_model.signatures.roles import Role
+from export_model.signatures.sampling import draw_cases
 from tests.conftest import Chosen
 from tests.corpus.conftest import SHARED
 

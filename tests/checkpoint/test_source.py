@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.files import tensorflow_messages as schema
-from converters.formats.source import ReadOptions
-from converters.graph.run import run_graph
-from converters.policy.policy import Policy
-from exporter.export.pipeline import ExportOptions, export
-from exporter.export.sources import Source, read_source
-from signatures.errors import ExportModelError, NotAPolicyError, SourceError, UsageError
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.formats.source import ReadOptions
+from export_model.converters.graph.run import run_graph
+from export_model.converters.policy.policy import Policy
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.export.sources import Source, read_source
+from export_model.signatures.errors import ExportModelError, NotAPolicyError, SourceError, UsageError
 from tests.checkpoint.writing import TrainingGraph, bundle, expected, policy
 
 OBSERVATION = np.linspace(-1, 1, 12, dtype=np.float32).reshape(4, 3)

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from converters.formats.checkpoint import table as module
-from converters.formats.checkpoint.crc32c import crc32c, mask_crc
-from converters.formats.checkpoint.table import MAGIC, read_table
-from signatures.errors import DamagedFileError, ExportModelError
+from export_model.converters.formats.checkpoint import table as module
+from export_model.converters.formats.checkpoint.crc32c import crc32c, mask_crc
+from export_model.converters.formats.checkpoint.table import MAGIC, read_table
+from export_model.signatures.errors import DamagedFileError, ExportModelError
 from tests.checkpoint.writing import block, table, varint
 from tests.conftest import examples
 
@@ -51,7 +51,7 @@ def test_crc32c_in_lanes_is_the_same(extra: int, pattern: bytes) -> None:
 
 
 def _by_pieces(data: bytes) -> int:
-    import converters.formats.checkpoint.crc32c as own
+    import export_model.converters.formats.checkpoint.crc32c as own
 
     return own._scalar(0xFFFFFFFF, data) ^ 0xFFFFFFFF
 

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from converters.files import tensorflow_messages as schema
-from converters.formats.checkpoint.crc32c import crc32c, mask_crc
-from converters.formats.checkpoint.table import MAGIC
-from converters.formats.checkpoint.tensor_bundle import Extents, slice_key
-from converters.formats.frozen_graph.tensors import from_array
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.formats.checkpoint.crc32c import crc32c, mask_crc
+from export_model.converters.formats.checkpoint.table import MAGIC
+from export_model.converters.formats.checkpoint.tensor_bundle import Extents, slice_key
+from export_model.converters.formats.frozen_graph.tensors import from_array
 
 Pairs = Sequence[tuple[bytes, bytes]]
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.export.pipeline import ExportOptions, export
 from fixtures import path as fixture
 
 ROOT = Path(__file__).resolve().parents[2]

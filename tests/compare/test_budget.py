@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from exporter.verify.checks.size import check_budget, parse_budget, sizes
-from signatures.errors import UsageError
+from export_model.exporter.verify.checks.size import check_budget, parse_budget, sizes
+from export_model.signatures.errors import UsageError
 
 WRITTEN = {"tfjs": 50_000, "onnx": 30_000}
 

@@ -13,17 +13,17 @@ import onnx
 import pytest
 from onnx import helper, numpy_helper
 
-from converters.files import tensorflow_messages as schema
-from converters.formats.format import Ports
-from converters.formats.frozen_graph.tensors import from_array, to_array
-from converters.formats.registry import WRITTEN
-from converters.runtimes.pool import RuntimePool
-from exporter.compare.matching import Artefact, labels_of
-from exporter.export.pipeline import ExportOptions, export
-from exporter.verify.findings import Finding
-from exporter.verify.report import ParityReport
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.formats.format import Ports
+from export_model.converters.formats.frozen_graph.tensors import from_array, to_array
+from export_model.converters.formats.registry import WRITTEN
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.compare.matching import Artefact, labels_of
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.verify.findings import Finding
+from export_model.exporter.verify.report import ParityReport
+from export_model.signatures.errors import RuntimeUnavailableError, UsageError
 from fixtures import path as fixture
-from signatures.errors import RuntimeUnavailableError, UsageError
 from tests.commands import export_model, is_refused
 from tests.comparing import compare_artefacts
 
@@ -269,7 +269,7 @@ def endless(model: onnx.ModelProto) -> None:
 def test_a_candidate_that_loops_for_ever_is_stopped(
     bundles: Bundles, tmp_path: Path, pool: RuntimePool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("converters.files.children.time_limits.FIRST", 3.0)
+    monkeypatch.setattr("export_model.converters.files.children.time_limits.FIRST", 3.0)
     made = edited(bundles("continuous") / "continuous.onnx", tmp_path / "endless.onnx", endless)
     report = compare_artefacts(bundles("continuous"), [made], runtimes="onnxruntime", pool=pool)
     assert "did not come to an end" in only_failure(report).reason

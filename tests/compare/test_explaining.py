@@ -10,8 +10,8 @@ import onnx
 import pytest
 from onnx import helper, numpy_helper
 
-from converters.runtimes.pool import RuntimePool
-from exporter.export.pipeline import ExportOptions, export
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.export.pipeline import ExportOptions, export
 from fixtures import path as fixture
 from tests.comparing import compare_artefacts
 

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from exporter.export.sources import read_source
-from exporter.verify.golden import read_golden
+from export_model.exporter.export.sources import read_source
+from export_model.exporter.verify.golden import read_golden
+from export_model.signatures.errors import UsageError
+from export_model.signatures.spec import PolicySignature
 from fixtures import path as fixture
-from signatures.errors import UsageError
-from signatures.spec import PolicySignature
 
 
 def signature(name: str) -> PolicySignature:

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from converters.runtimes.pool import RuntimePool
-from exporter.export.pipeline import ExportOptions, export
-from exporter.verify.report import ParityReport
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.verify.report import ParityReport
 from tests.comparing import compare_artefacts
 from tests.interfaces.made import MJLAB, write_onnx
 

@@ -11,8 +11,8 @@ import onnx
 import pytest
 from onnx import numpy_helper
 
-from converters.runtimes.pool import RuntimePool
-from exporter.verify.report import ParityReport
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.verify.report import ParityReport
 from tests.comparing import compare_artefacts
 
 ROOT = Path(__file__).resolve().parents[2] / "fixtures"

@@ -9,11 +9,11 @@ import onnx
 import pytest
 from onnx import TensorProto, helper
 
-from converters.formats.format import Port
-from converters.formats.read import ports_of
-from exporter.export.pipeline import ExportOptions, export
+from export_model.converters.formats.format import Port
+from export_model.converters.formats.read import ports_of
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.signatures.errors import DamagedFileError, NotAPolicyError, SourceError
 from fixtures import path as fixture
-from signatures.errors import DamagedFileError, NotAPolicyError, SourceError
 from tests.commands import export_model
 
 
@@ -93,7 +93,7 @@ def test_damaged_files_are_named(tmp_path: Path, bundle: Path) -> None:
 
 
 def test_a_saved_model_without_a_signature_cannot_be_called(tmp_path: Path, bundle: Path) -> None:
-    from converters.files import tensorflow_messages as schema
+    from export_model.converters.files import tensorflow_messages as schema
 
     message = schema.parse(schema.SavedModel, (bundle / "saved_model" / "saved_model.pb").read_bytes(), "SavedModel")
     message.meta_graphs[0].signature_def.clear()

@@ -9,11 +9,11 @@ import onnx
 import pytest
 from onnx import numpy_helper
 
-from converters.compiler.passes.weights import Storage
-from converters.runtimes.pool import RuntimePool
-from exporter.compare.weights import rounded_to
-from exporter.export.again import verify_folder
-from exporter.export.pipeline import ExportOptions, export
+from export_model.converters.compiler.passes.weights import Storage
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.compare.weights import rounded_to
+from export_model.exporter.export.again import verify_folder
+from export_model.exporter.export.pipeline import ExportOptions, export
 from fixtures import path as fixture
 from tests.comparing import compare_artefacts
 from tests.faults.artefacts import opened

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from converters.formats.programs import artifact
-from converters.formats.registry import WRITTEN
-from converters.runtimes.pool import RuntimePool
-from exporter.export.pipeline import ExportOptions, export
+from export_model.converters.formats.programs import artifact
+from export_model.converters.formats.registry import WRITTEN
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.signatures.errors import NotAPolicyError, SourceError, UnsupportedOpError
 from fixtures import path as fixture
-from signatures.errors import NotAPolicyError, SourceError, UnsupportedOpError
 from tests.comparing import compare_artefacts
 from tests.programs.test_programs import need
 

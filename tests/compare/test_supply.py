@@ -7,7 +7,7 @@ import re
 import subprocess
 import sys
 
-from exporter import __version__
+from export_model.exporter import __version__
 from tests.commands import ROOT
 
 WORKFLOWS = sorted((ROOT / ".github/workflows").glob("*.yml"))

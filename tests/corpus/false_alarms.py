@@ -17,12 +17,12 @@ import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from converters.runtimes.pool import RuntimePool
-from exporter.export.pipeline import ExportOptions, export
-from exporter.reports.summary import failure_lines
-from exporter.verify.options import VerifyOptions
-from exporter.verify.report import ParityReport
-from signatures.errors import SourceError
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.reports.summary import failure_lines
+from export_model.exporter.verify.options import VerifyOptions
+from export_model.exporter.verify.report import ParityReport
+from export_model.signatures.errors import SourceError
 
 GENUINE = Path(__file__).resolve().parents[3] / "shared" / "genuine"
 SEEDS = tuple(range(10))

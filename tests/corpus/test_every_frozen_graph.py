@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from converters.runtimes.pool import RuntimePool
-from exporter.export.pipeline import ExportOptions, export
-from exporter.inspect.inspection import inspect_source
-from exporter.reports.summary import failure_lines
-from exporter.verify.options import VerifyOptions
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.inspect.inspection import inspect_source
+from export_model.exporter.reports.summary import failure_lines
+from export_model.exporter.verify.options import VerifyOptions
 from tests import known
 from tests.conftest import Chosen, formats_in
 from tests.corpus.conftest import SHARED, frozen_corpus, genuine_cases

@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.formats.format import WriteOptions
-from converters.formats.registry import WRITTEN
-from converters.formats.source import ReadOptions
-from converters.policy.policy import Policy
-from converters.runtimes.pool import RuntimePool
-from exporter.export.sources import read_source
-from signatures.memories import SourcePart
-from signatures.roles import OBSERVATIONS, Role
+from export_model.converters.formats.format import WriteOptions
+from export_model.converters.formats.registry import WRITTEN
+from export_model.converters.formats.source import ReadOptions
+from export_model.converters.policy.policy import Policy
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.memories import SourcePart
+from export_model.signatures.roles import OBSERVATIONS, Role
 from tests.conftest import Chosen
 from tests.corpus.conftest import SHARED
 

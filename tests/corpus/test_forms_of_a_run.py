@@ -17,16 +17,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.compiler.options import CompileOptions
-from converters.graph.nodes import node_of
-from converters.graph.run import run_graph
-from converters.policy.policy import Policy
-from exporter.export.sources import read_source
-from exporter.verify.difference import compare
-from exporter.verify.tolerances import Tolerance, tolerance_for
-from signatures.errors import DamagedFileError, ExportModelError
-from signatures.roles import Role
-from signatures.sampling import FAR_CASES, HUGE_BATCH, draw_cases
+from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.graph.nodes import node_of
+from export_model.converters.graph.run import run_graph
+from export_model.converters.policy.policy import Policy
+from export_model.exporter.export.sources import read_source
+from export_model.exporter.verify.difference import compare
+from export_model.exporter.verify.tolerances import Tolerance, tolerance_for
+from export_model.signatures.errors import DamagedFileError, ExportModelError
+from export_model.signatures.roles import Role
+from export_model.signatures.sampling import FAR_CASES, HUGE_BATCH, draw_cases
 from tests.corpus.conftest import SHARED
 
 pytestmark = pytest.mark.corpus

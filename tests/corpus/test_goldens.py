@@ -17,14 +17,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.files.children.process import LoadedModel
-from converters.formats.format import WriteOptions
-from converters.formats.registry import DEFAULTS, WRITTEN
-from converters.policy.policy import Policy
-from converters.runtimes.pool import RuntimePool
-from exporter.verify.difference import compare
-from exporter.verify.tolerances import Tolerance, tolerance_for
-from signatures.roles import Role
+from export_model.converters.files.children.process import LoadedModel
+from export_model.converters.formats.format import WriteOptions
+from export_model.converters.formats.registry import DEFAULTS, WRITTEN
+from export_model.converters.policy.policy import Policy
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.verify.difference import compare
+from export_model.exporter.verify.tolerances import Tolerance, tolerance_for
+from export_model.signatures.roles import Role
 from tests import known
 from tests.conftest import FULL, NEEDED
 from tests.corpus.conftest import genuine_cases

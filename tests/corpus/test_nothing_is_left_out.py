@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from exporter.export.sources import read_source
+from export_model.exporter.export.sources import read_source
 from tests.barracuda.conftest import public_files
 from tests.corpus.conftest import SHARED, frozen_corpus
 

@@ -78,8 +78,8 @@ def test_nothing_is_fetched(site: Path, parsed: dict[Path, _Page]) -> None:
 
 
 def test_the_reference_is_whole(parsed: dict[Path, _Page]) -> None:
-    import exporter
-    from exporter.cli.app import app
+    from export_model import exporter
+    from export_model.exporter.cli.app import app
 
     names = {name for page in parsed.values() for name in page.names}
     for function in (n for n in exporter.__all__ if not n.startswith("_")):

@@ -11,19 +11,19 @@ import click
 import numpy as np
 import pytest
 
-from converters.consumers.profiles import PROFILES, profile
-from converters.formats.registry import WRITTEN
-from exporter.cli.app import app
-from exporter.demo import BALL
-from exporter.snippets.registry import TARGETS
-from exporter.verify import cut, rounding, statistics
-from exporter.verify.checks import decisions, densities, mixed
-from exporter.verify.difference import SHARE, SIZE
-from exporter.verify.options import VerifyOptions
-from exporter.verify.tolerances import ATOL, RTOL, Tolerance, tolerance_for
-from exporter.verify.work import SECONDS
-from signatures.errors import ParityError, RuntimeUnavailableError, SourceError, UsageError
-from signatures.sampling import HUGE_BATCH, LARGE_BATCH, MOST_IDS
+from export_model.converters.consumers.profiles import PROFILES, profile
+from export_model.converters.formats.registry import WRITTEN
+from export_model.exporter.cli.app import app
+from export_model.exporter.demo import BALL
+from export_model.exporter.snippets.registry import TARGETS
+from export_model.exporter.verify import cut, rounding, statistics
+from export_model.exporter.verify.checks import decisions, densities, mixed
+from export_model.exporter.verify.difference import SHARE, SIZE
+from export_model.exporter.verify.options import VerifyOptions
+from export_model.exporter.verify.tolerances import ATOL, RTOL, Tolerance, tolerance_for
+from export_model.exporter.verify.work import SECONDS
+from export_model.signatures.errors import ParityError, RuntimeUnavailableError, SourceError, UsageError
+from export_model.signatures.sampling import HUGE_BATCH, LARGE_BATCH, MOST_IDS
 from tests.commands import ROOT, export_model
 from tests.docs.blocks import name_of, pages
 

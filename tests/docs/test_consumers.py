@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 
-from converters.consumers.published import consumer_tables
-from converters.consumers.unity.importers import IMPORTERS
+from export_model.converters.consumers.published import consumer_tables
+from export_model.converters.consumers.unity.importers import IMPORTERS
 from tests import consumers
 from tests.commands import export_model, is_refused
 

@@ -90,7 +90,11 @@ def test_every_block_runs_in_order(installed: Path, tmp_path: Path) -> None:
             count += block.language in LANGUAGES and block.verb != "skip"
     assert count > 25
     found = subprocess.run(
-        [str(installed), "-c", "import exporter, export_model; print(exporter.__file__, export_model.__file__)"],
+        [
+            str(installed),
+            "-c",
+            "from export_model import exporter, export_model; print(exporter.__file__, export_model.__file__)",
+        ],
         env=reader._environment(),
         cwd=folder,
         capture_output=True,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 
-from converters.runtimes.pool import INDEPENDENT
+from export_model.converters.runtimes.pool import INDEPENDENT
 from tests import figures
 from tests.commands import ROOT
 from tests.reports.made import comparison

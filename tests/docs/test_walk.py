@@ -9,8 +9,8 @@ from types import FrameType
 
 import pytest
 
-from exporter.export.options import ExportOptions
-from exporter.export.pipeline import export
+from export_model.exporter.export.options import ExportOptions
+from export_model.exporter.export.pipeline import export
 from tests.commands import ROOT
 
 PAGE = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")

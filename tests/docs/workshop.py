@@ -20,7 +20,7 @@ from pathlib import Path
 
 import pytest
 
-from exporter.demo.files import write_files
+from export_model.exporter.demo.files import write_files
 from tests.commands import PLACES, ROOT
 from tests.docs.blocks import Block
 from tests.serve.browsing import needed, visit

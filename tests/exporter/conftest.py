@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from exporter.export.pipeline import ExportResult
+from export_model.exporter.export.pipeline import ExportResult
 from fixtures import path as fixture
 from tests.exporter.rehearsal import ActingPool, Exporting, export
 

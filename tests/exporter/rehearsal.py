@@ -11,18 +11,18 @@ from typing import Any
 import numpy.typing as npt
 import pytest
 
-from converters.compiler.passes.normalise import normalise
-from converters.files.children.process import RunFailedError
-from converters.formats.frozen_graph.reader import read_graph
-from converters.graph.jitter import Jitter
-from converters.graph.nodes import Graph
-from converters.graph.run import run_graph
-from converters.runtimes import pool as runtimes
-from converters.runtimes.registry import RuntimeInfo
-from exporter.export import pipeline
-from exporter.export.pipeline import ExportResult
-from exporter.verify.cut import CUT
-from exporter.verify.report import ParityReport
+from export_model.converters.compiler.passes.normalise import normalise
+from export_model.converters.files.children.process import RunFailedError
+from export_model.converters.formats.frozen_graph.reader import read_graph
+from export_model.converters.graph.jitter import Jitter
+from export_model.converters.graph.nodes import Graph
+from export_model.converters.graph.run import run_graph
+from export_model.converters.runtimes import pool as runtimes
+from export_model.converters.runtimes.registry import RuntimeInfo
+from export_model.exporter.export import pipeline
+from export_model.exporter.export.pipeline import ExportResult
+from export_model.exporter.verify.cut import CUT
+from export_model.exporter.verify.report import ParityReport
 
 Array = npt.NDArray[Any]
 Tensors = dict[str, Array]

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.files.chunks import Pieces
-from exporter import export_model as export_by_python
-from exporter.verify.options import VerifyOptions
-from exporter.verify.tolerances import Tolerance
+from export_model.converters.files.chunks import Pieces
+from export_model.exporter import export_model as export_by_python
+from export_model.exporter.verify.options import VerifyOptions
+from export_model.exporter.verify.tolerances import Tolerance
+from export_model.signatures.errors import RefusedError, UsageError
 from fixtures import path as fixture
-from signatures.errors import RefusedError, UsageError
 from tests.commands import export_model, files_in, is_refused, python
 from tests.handmade import continuous_policy, graph_bytes
 
@@ -310,7 +310,7 @@ def test_a_source_that_is_refused_does_not_stop_the_others(ball: Path, tmp_path:
 
 AS_NOBODY = """
 import os, sys
-from exporter.cli.main import main
+from export_model.exporter.cli.main import main
 from fixtures import path
 from tests.commands import export_model
 warm, *arguments = sys.argv[1:]

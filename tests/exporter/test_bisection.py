@@ -11,24 +11,24 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from msgspec.structs import replace
 
-from converters.compiler.options import CompileOptions
-from converters.files.children.process import RunFailedError
-from converters.formats.bundle.embed import runnable
-from converters.formats.frozen_graph.reader import read_graph
-from converters.formats.intermediate_tensors import InnerTensors, View
-from converters.formats.onnx.tensor_map import TensorMap, loads
-from converters.graph.nodes import Graph, Node
-from converters.graph.run import run_graph
-from converters.policy.policy import Policy
-from exporter.export.pipeline import ExportOptions, export
-from exporter.verify import bisection as bisect
-from exporter.verify.bisection import _Search
-from exporter.verify.difference import compare
-from exporter.verify.findings import Bisection, Numbers
-from exporter.verify.participants import Feeds
-from exporter.verify.tolerances import Tolerance
+from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.files.children.process import RunFailedError
+from export_model.converters.formats.bundle.embed import runnable
+from export_model.converters.formats.frozen_graph.reader import read_graph
+from export_model.converters.formats.intermediate_tensors import InnerTensors, View
+from export_model.converters.formats.onnx.tensor_map import TensorMap, loads
+from export_model.converters.graph.nodes import Graph, Node
+from export_model.converters.graph.run import run_graph
+from export_model.converters.policy.policy import Policy
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.verify import bisection as bisect
+from export_model.exporter.verify.bisection import _Search
+from export_model.exporter.verify.difference import compare
+from export_model.exporter.verify.findings import Bisection, Numbers
+from export_model.exporter.verify.participants import Feeds
+from export_model.exporter.verify.tolerances import Tolerance
+from export_model.signatures.sampling import draw_cases
 from fixtures import path as fixture
-from signatures.sampling import draw_cases
 
 
 @pytest.fixture(scope="module")

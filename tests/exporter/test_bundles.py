@@ -12,17 +12,17 @@ from typing import Any
 import onnx
 import pytest
 
-from converters.files.tensorflow_messages import SavedModel, parse
-from converters.formats.bundle import bundle
-from converters.formats.bundle.bundle import Bundle
-from converters.formats.frozen_graph.reader import from_graph_def, read_graph
-from converters.graph.nodes import Graph
-from exporter import __version__
+from export_model.converters.files.tensorflow_messages import SavedModel, parse
+from export_model.converters.formats.bundle import bundle
+from export_model.converters.formats.bundle.bundle import Bundle
+from export_model.converters.formats.frozen_graph.reader import from_graph_def, read_graph
+from export_model.converters.graph.nodes import Graph
+from export_model.exporter import __version__
+from export_model.signatures.contract import EMBEDDED
+from export_model.signatures.errors import BundleError
+from export_model.signatures.roles import Role
 from fixtures import FIXTURES
 from fixtures import path as fixture
-from signatures.contract import EMBEDDED
-from signatures.errors import BundleError
-from signatures.roles import Role
 from tests.commands import export_model, files_in, is_refused
 
 POLICIES = [*(n for n in FIXTURES if n != "twobrains"), "twobrains-StrikerBrain", "twobrains-Goalie-Brain-2"]

@@ -14,11 +14,11 @@ from pathlib import Path
 import click
 import pytest
 
-import exporter
-from converters.formats.registry import DEFAULTS
-from exporter.cli.app import app
-from exporter.cli.console import Console
-from exporter.cli.group import GROUPS, Command
+from export_model import exporter
+from export_model.converters.formats.registry import DEFAULTS
+from export_model.exporter.cli.app import app
+from export_model.exporter.cli.console import Console
+from export_model.exporter.cli.group import GROUPS, Command
 from fixtures import path as fixture
 from tests.commands import ROOT, export_model, files_in, is_refused, python
 from tests.handmade import continuous_policy, graph_bytes, sampled_policy
@@ -161,10 +161,10 @@ def test_the_version_is_the_packages() -> None:
 
 
 def test_the_module_is_the_command() -> None:
-    ran = python("-m", "exporter", "inspect", BALL, "--json")
+    ran = python("-m", "export_model", "inspect", BALL, "--json")
     assert (ran.status, ran.err) == (0, "")
     assert ran.out == export_model("inspect", BALL, "--json").out
-    is_refused(python("-m", "exporter", "nothing.bytes"), "nothing.bytes: no such file")
+    is_refused(python("-m", "export_model", "nothing.bytes"), "nothing.bytes: no such file")
 
 
 # ------------------------------------------------------------------ export
@@ -328,7 +328,7 @@ def test_roles_and_values_can_be_given(tmp_path: Path) -> None:
 def test_a_console_without_greek_letters_shows_the_rest(tmp_path: Path) -> None:
     """The head of the long table has a Δ, which few 8-bit encodings of a pipe have."""
     ran = python(
-        *("-m", "exporter", BALL, "-o", tmp_path, "--verify", "onnxruntime", "-v"),
+        *("-m", "export_model", BALL, "-o", tmp_path, "--verify", "onnxruntime", "-v"),
         environment={"PYTHONIOENCODING": "iso8859-5"},
     )
     assert ran.status == 0
@@ -339,11 +339,11 @@ def test_a_console_without_greek_letters_shows_the_rest(tmp_path: Path) -> None:
 def test_a_file_name_that_is_no_text_is_no_trouble(tmp_path: Path) -> None:
     name = tmp_path / os.fsdecode(b"b\xff.bytes")
     name.write_bytes(BALL.read_bytes())
-    ran = python("-m", "exporter", name, "-o", tmp_path / "out", *UNVERIFIED)
+    ran = python("-m", "export_model", name, "-o", tmp_path / "out", *UNVERIFIED)
     assert (ran.status, ran.err) == (0, "")
     assert "out/b-/policy.json" in files_in(tmp_path)
     assert json.loads((tmp_path / "out" / "b-" / "policy.json").read_text())["source"]["path"] == "b\ufffd.bytes"
-    assert python("-m", "exporter", "inspect", name).status == 0
+    assert python("-m", "export_model", "inspect", name).status == 0
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full here")
@@ -352,7 +352,7 @@ def test_output_that_cannot_be_written_is_an_error(command: list[str], tmp_path:
     arguments = [a.format(out=tmp_path) for a in command]
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(
-            [sys.executable, "-m", "exporter", *arguments, str(BALL)],
+            [sys.executable, "-m", "export_model", *arguments, str(BALL)],
             cwd=ROOT,
             stdout=full,
             stderr=subprocess.PIPE,
@@ -371,7 +371,7 @@ def test_an_interrupted_run_says_stopped(tmp_path: Path, monkeypatch: pytest.Mon
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("exporter.export.sources.compile_graph", interrupted)
+    monkeypatch.setattr("export_model.exporter.export.sources.compile_graph", interrupted)
     ran = export_model(BALL, "-o", tmp_path / "out", *UNVERIFIED)
     assert (ran.status, ran.out) == (130, "")
     assert ran.err.strip() == "stopped"

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from converters.formats.registry import WRITTEN
-from converters.runtimes.base import Progress
-from converters.runtimes.javascript.node import install_packages
-from converters.runtimes.registry import RUNTIMES, Runtime
+from export_model.converters.formats.registry import WRITTEN
+from export_model.converters.runtimes.base import Progress
+from export_model.converters.runtimes.javascript.node import install_packages
+from export_model.converters.runtimes.registry import RUNTIMES, Runtime
 from fixtures import path as fixture
 from fixtures.trained import run_folder as trained_run
 from tests.commands import ROOT, export_model, files_in, is_refused
@@ -80,7 +80,7 @@ def test_inspection_says_which_format_cannot_take_a_policy(monkeypatch: pytest.M
     def refusing(*_: object) -> None:
         raise TypeError("no")
 
-    monkeypatch.setattr("converters.formats.tfjs.writer.write", refusing)
+    monkeypatch.setattr("export_model.converters.formats.tfjs.writer.write", refusing)
     found = export_model("inspect", BALL, "--json").json["policies"][0]["targets"]
     assert found["onnx"] == {"ok": True, "reason": None}
     assert found["tfjs"] == {"ok": False, "reason": "the graph cannot be understood"}
@@ -149,6 +149,6 @@ def test_installing_reports_its_steps(monkeypatch: pytest.MonkeyPatch, name: str
         progress("js")
 
     steps = {n: partial(lambda text, progress: progress(text), n) for n in ("tf1.4", "tf1.7")}
-    monkeypatch.setattr("converters.runtimes.registry.RUNTIMES", tuple(stand_in(r) for r in RUNTIMES))
+    monkeypatch.setattr("export_model.converters.runtimes.registry.RUNTIMES", tuple(stand_in(r) for r in RUNTIMES))
     ran = export_model("runtimes", "install", name)
     assert (ran.status, ran.out.splitlines(), ran.err) == (0, said, "")

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from msgspec.structs import replace
 
-from exporter.verify.difference import (
+from export_model.exporter.verify.difference import (
     compare,
     compare_all,
     floor_log_probs,
@@ -21,11 +21,20 @@ from exporter.verify.difference import (
     steps,
     ties,
 )
-from exporter.verify.excuses import BOTH_NAN, CHAOS, EXCUSES, NAN_FROM_ZERO, ROUNDING, TIE, Excuse, Forgiven
-from exporter.verify.statistics import FALSE_ALARM, chi_square_survival, fit
-from exporter.verify.tolerances import ATOL, RTOL, Tolerance, tolerance_for
-from signatures.roles import Role
-from signatures.spec import PolicySignature, TensorSpec
+from export_model.exporter.verify.excuses import (
+    BOTH_NAN,
+    CHAOS,
+    EXCUSES,
+    NAN_FROM_ZERO,
+    ROUNDING,
+    TIE,
+    Excuse,
+    Forgiven,
+)
+from export_model.exporter.verify.statistics import FALSE_ALARM, chi_square_survival, fit
+from export_model.exporter.verify.tolerances import ATOL, RTOL, Tolerance, tolerance_for
+from export_model.signatures.roles import Role
+from export_model.signatures.spec import PolicySignature, TensorSpec
 
 PLAIN = Tolerance()
 

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from exporter.demo.files import FILES
-from exporter.play.environments import ENVIRONMENTS
-from exporter.play.environments.tennis import BRAINS, follow_ball
+from export_model.exporter.demo.files import FILES
+from export_model.exporter.play.environments import ENVIRONMENTS
+from export_model.exporter.play.environments.tennis import BRAINS, follow_ball
 from tests.commands import export_model, files_in, is_refused
 
 

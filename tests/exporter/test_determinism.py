@@ -49,7 +49,7 @@ def test_the_bytes_do_not_depend_on_the_process_or_its_hashes(seed: str, tmp_pat
     surroundings = {"PYTHONHASHSEED": seed, "TZ": "Asia/Tokyo", "LC_ALL": "C", "HOME": str(tmp_path)}
     (tmp_path / "elsewhere").mkdir()
     ran = python(
-        *("-m", "exporter", *map(fixture, FIXTURES), "-o", "there", "--verify", "none"),
+        *("-m", "export_model", *map(fixture, FIXTURES), "-o", "there", "--verify", "none"),
         environment=surroundings,
         cwd=tmp_path / "elsewhere",
     )

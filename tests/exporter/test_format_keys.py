@@ -7,8 +7,8 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from converters.formats.registry import WRITTEN
-from converters.runtimes.registry import RUNTIMES
+from export_model.converters.formats.registry import WRITTEN
+from export_model.converters.runtimes.registry import RUNTIMES
 from tests.exporter.test_imports import MODULES, ROOT, name_of
 
 #: Words of this project's own: others, such as ``c`` and ``bytes``, are those of runtimes, units and languages, too.

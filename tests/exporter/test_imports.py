@@ -11,9 +11,9 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
-import exporter
-from converters.formats.registry import ROOMS
-from exporter.cli.app import app
+from export_model import exporter
+from export_model.converters.formats.registry import ROOMS
+from export_model.exporter.cli.app import app
 from tests.commands import ROOT, python
 
 #: package → the packages of this project that it may import
@@ -101,7 +101,7 @@ def test_only_the_children_and_what_acts_import_a_runtime() -> None:
 def own_imports(path: Path, names: set[str]) -> set[str]:
     """The modules of this project that a module imports, lazily too; those for type checking alone do not count.
 
-    A block for type checking with an ``else`` names what is deferred (``converters.formats.format``).
+    A block for type checking with an ``else`` names what is deferred (``export_model.converters.formats.format``).
     """
     tree = ast.parse(path.read_text(encoding="utf-8"))
     for found in ast.walk(tree):
@@ -162,10 +162,10 @@ def test_rooms_import_only_those_below_them() -> None:
 
 def test_readers_name_no_trainer() -> None:
     """A trainer is a room and a line of the registry: no reader asks one by its name."""
-    from converters.trainers.registry import ROOMS
+    from export_model.converters.trainers.registry import ROOMS
 
     names = {name_of(p).removesuffix(".py").removesuffix("/__init__").replace("/", ".") for p in MODULES}
-    theirs = {n for n in names for room in ROOMS if f"{n}.".startswith(f"converters.trainers.{room}.")}
+    theirs = {n for n in names for room in ROOMS if f"{n}.".startswith(f"export_model.converters.trainers.{room}.")}
     outside = [p for p in MODULES if not p.is_relative_to(ROOT / "converters/trainers")]
     assert importing(outside, lambda m: own_imports(m, names) & theirs) == {}
 
@@ -177,7 +177,7 @@ def test_every_module_of_converters_lies_in_a_room() -> None:
 
 def test_nothing_below_the_command_line_asks_it() -> None:
     modules = [m for m in MODULES if not m.is_relative_to(ROOT / "exporter/cli") and m.name != "__main__.py"]
-    asking = [name_of(m) for m in modules if "exporter.cli" in m.read_text(encoding="utf-8")]
+    asking = [name_of(m) for m in modules if "export_model.exporter.cli" in m.read_text(encoding="utf-8")]
     assert asking == []
 
 
@@ -193,7 +193,7 @@ def loaded_by(*arguments: object) -> set[str]:
 
 
 def test_help_starts_without_anything_heavy() -> None:
-    loaded = loaded_by("-m", "exporter", "--help")
+    loaded = loaded_by("-m", "export_model", "--help")
     assert "click" in loaded
     assert not loaded & {"tensorflow", "onnxruntime", "onnx", "rich", "numpy", "google", "converters"}
 
@@ -208,70 +208,97 @@ NOT_LOADED = (
     *("rich", "email", "http", "ssl", "socket", "asyncio", "multiprocessing", "subprocess", "tarfile"),
     *("numpy.ma", "numpy.random", "numpy.testing", "numpy.fft", "numpy.polynomial", "numpy.f2py", "numpy.ctypeslib"),
     *(
-        "converters.formats.barracuda.writer",
-        "converters.formats.barracuda.reader",
-        "converters.consumers",
-        "converters.formats.live",
+        "export_model.converters.formats.barracuda.writer",
+        "export_model.converters.formats.barracuda.reader",
+        "export_model.converters.consumers",
+        "export_model.converters.formats.live",
     ),
     *(
-        "converters.formats.torch_checkpoint.source",
-        "converters.formats.keras.source",
-        "converters.formats.stable_baselines3.source",
+        "export_model.converters.formats.torch_checkpoint.source",
+        "export_model.converters.formats.keras.source",
+        "export_model.converters.formats.stable_baselines3.source",
     ),
     *(
-        "converters.runtimes",
-        "converters.formats.onnx.reader",
-        "converters.formats.onnx.importer",
-        "converters.formats.tensorboard",
+        "export_model.converters.runtimes",
+        "export_model.converters.formats.onnx.reader",
+        "export_model.converters.formats.onnx.importer",
+        "export_model.converters.formats.tensorboard",
     ),
-    *("exporter.verify.verification", "exporter.verify.findings", "exporter.verify.report", "exporter.verify.trial"),
-    *("exporter.reports", "exporter.serve", "exporter.acting", "exporter.compare", "exporter.inspect", "exporter.demo"),
+    *(
+        "export_model.exporter.verify.verification",
+        "export_model.exporter.verify.findings",
+        "export_model.exporter.verify.report",
+        "export_model.exporter.verify.trial",
+    ),
+    *(
+        "export_model.exporter.reports",
+        "export_model.exporter.serve",
+        "export_model.exporter.acting",
+        "export_model.exporter.compare",
+        "export_model.exporter.inspect",
+        "export_model.exporter.demo",
+    ),
     # other commands, and what only a page of links or completion asks for
-    *("exporter.cli.compare", "exporter.cli.inspect", "exporter.cli.verify", "exporter.cli.serve", "exporter.cli.demo"),
-    *("exporter.cli.snippets", "exporter.cli.runtimes", "exporter.cli.completion"),
+    *(
+        "export_model.exporter.cli.compare",
+        "export_model.exporter.cli.inspect",
+        "export_model.exporter.cli.verify",
+        "export_model.exporter.cli.serve",
+        "export_model.exporter.cli.demo",
+    ),
+    *(
+        "export_model.exporter.cli.snippets",
+        "export_model.exporter.cli.runtimes",
+        "export_model.exporter.cli.completion",
+    ),
     *("html", "click.shell_completion"),
-    *("exporter.snippets", "exporter.fleet.fleet", "exporter.fleet.worker", "exporter.export.again"),
+    *(
+        "export_model.exporter.snippets",
+        "export_model.exporter.fleet.fleet",
+        "export_model.exporter.fleet.worker",
+        "export_model.exporter.export.again",
+    ),
 )
 
 
 def test_a_plain_export_imports_what_it_uses(tmp_path: Path) -> None:
     script = (
-        "import sys\nfrom exporter.cli.main import main\n"
+        "import sys\nfrom export_model.exporter.cli.main import main\n"
         "try:\n    main(sys.argv[1:])\nexcept SystemExit:\n    pass\n"
         "print(*sys.modules)"
     )
     ran = python("-c", script, ROOT / "fixtures" / "continuous.bytes", "-o", tmp_path, "--verify", "none")
     loaded = set(ran.out.splitlines()[-1].split())
-    assert "converters.formats.onnx.writer" in loaded
+    assert "export_model.converters.formats.onnx.writer" in loaded
     assert {m for m in loaded for name in NOT_LOADED if m == name or m.startswith(f"{name}.")} == set()
 
 
 def test_a_verified_bundle_is_vetted_without_what_costs_most(tmp_path: Path) -> None:
     """A quarter of a second for the package ``onnx``, 25 ms for a version."""
-    python("-m", "exporter", ROOT / "fixtures" / "continuous.bytes", "-o", tmp_path, "--verify", "none")
+    python("-m", "export_model", ROOT / "fixtures" / "continuous.bytes", "-o", tmp_path, "--verify", "none")
     script = (
-        "import sys\nfrom exporter.cli.main import main\n"
+        "import sys\nfrom export_model.exporter.cli.main import main\n"
         "try:\n    main(['verify', sys.argv[1], '--runtimes', 'onnxruntime'])\nexcept SystemExit:\n    pass\n"
         "print(*sys.modules)"
     )
     *said, last = python("-c", script, tmp_path / "continuous").out.splitlines()
     loaded = set(last.split())
     assert said[-1].startswith("PASSED")
-    assert "converters.formats.onnx.vetted" in loaded
-    assert {"onnx", "importlib.metadata", "email", "converters.formats.onnx.reader"}.isdisjoint(loaded)
+    assert "export_model.converters.formats.onnx.vetted" in loaded
+    assert {"onnx", "importlib.metadata", "email", "export_model.converters.formats.onnx.reader"}.isdisjoint(loaded)
 
 
 def test_the_package_loads_its_functions_when_they_are_asked_for() -> None:
     code = "import sys, exporter; print('numpy' in sys.modules); exporter.export_model; print('numpy' in sys.modules)"
     assert python("-c", code).out.split() == ["False", "True"]
-    assert "has no attribute 'nothing'" in python("-c", "import exporter; exporter.nothing").err
+    assert "has no attribute 'nothing'" in python("-c", "from export_model import exporter; exporter.nothing").err
 
 
 def test_help_of_every_documented_class_is_shown() -> None:
     """The signature of a Struct evaluates its annotations, in which names for type checking alone are missing."""
     page = (ROOT / "docs/reference/python.md").read_text(encoding="utf-8")
     documented = re.findall(r"autoclass:: ([\w.]+)\.(\w+)", page)
-    assert ("exporter.export.pipeline", "ExportResult") in documented
+    assert ("export_model.exporter.export.pipeline", "ExportResult") in documented
     for module, name in documented:
         assert f"{name}(" in pydoc.plain(pydoc.render_doc(getattr(importlib.import_module(module), name))), name
 

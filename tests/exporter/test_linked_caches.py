@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from converters.files.fetch import inside
-from exporter import load_policy
+from export_model.converters.files.fetch import inside
+from export_model.exporter import load_policy
 from fixtures import path as fixture
 from tests.commands import export_model, is_refused
 from tests.fuzz.seeds import _seeds, files_of

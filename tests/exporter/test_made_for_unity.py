@@ -8,12 +8,12 @@ from typing import Any
 
 import pytest
 
-from converters.consumers.profiles import profile
-from exporter import export_model, verify_bundle
-from exporter.verify.checks.consumer import consumers
-from exporter.verify.options import VerifyOptions
+from export_model.converters.consumers.profiles import profile
+from export_model.exporter import export_model, verify_bundle
+from export_model.exporter.verify.checks.consumer import consumers
+from export_model.exporter.verify.options import VerifyOptions
+from export_model.signatures.errors import UsageError
 from fixtures import path as fixture
-from signatures.errors import UsageError
 
 
 @pytest.mark.parametrize(

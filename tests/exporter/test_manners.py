@@ -11,8 +11,8 @@ from pathlib import Path
 import click
 import pytest
 
-import exporter
-from exporter.cli.demo import _run_as_typed
+from export_model import exporter
+from export_model.exporter.cli.demo import _run_as_typed
 from fixtures import path as fixture
 from tests.commands import export_model, is_refused, python
 
@@ -63,7 +63,7 @@ def completed(shell: str, words: str) -> list[str]:
     if shell == "zsh":
         environment["COMP_CWORD"] = str(len(words.split(" ")) - 1)
     done = subprocess.run(
-        [sys.executable, "-m", "exporter"], env=environment, capture_output=True, encoding="utf-8", check=False
+        [sys.executable, "-m", "export_model"], env=environment, capture_output=True, encoding="utf-8", check=False
     )
     return done.stdout.splitlines()
 
@@ -111,7 +111,7 @@ class Interrupt:
         if name == "click":
             raise KeyboardInterrupt
 sys.meta_path.insert(0, Interrupt())
-from exporter.cli.main import main
+from export_model.exporter.cli.main import main
 main(["--help"])
 """
 
@@ -121,12 +121,12 @@ def test_an_interrupt_while_the_program_itself_is_loaded_is_no_traceback() -> No
     assert (ran.status, ran.out, ran.err) == (130, "", "\nstopped\n")
 
 
-#: Of what ``python -m exporter`` and the console script import, from the command line's first module on.
+#: Of what ``python -m export_model`` and the console script import, from the command line's first module on.
 EARLY = """
 import sys
 class Interrupt:
     def find_spec(self, name, path=None, target=None):
-        if name == "exporter.cli.main":
+        if name == "export_model.exporter.cli.main":
             raise KeyboardInterrupt
 sys.meta_path.insert(0, Interrupt())
 {start}
@@ -134,7 +134,11 @@ sys.meta_path.insert(0, Interrupt())
 
 
 @pytest.mark.parametrize(
-    "start", ["from exporter.cli.main import main", "import runpy; runpy.run_module('exporter', run_name='__main__')"]
+    "start",
+    [
+        "from export_model.exporter.cli.main import main",
+        "import runpy; runpy.run_module('exporter', run_name='__main__')",
+    ],
 )
 def test_an_interrupt_before_the_program_has_begun_is_no_traceback(start: str) -> None:
     ran = python("-c", EARLY.format(start=start))

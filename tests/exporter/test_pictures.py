@@ -13,13 +13,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from converters.files import tensorflow_messages as schema
-from converters.formats.frozen_graph.encode import as_read
-from converters.formats.frozen_graph.reader import read_graph
-from converters.formats.tensorboard import FILE_NAME, event_file
-from converters.graph.nodes import Graph, Node, TensorShape
-from exporter import export_model as export
-from exporter.export.sources import read_source
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.formats.frozen_graph.encode import as_read
+from export_model.converters.formats.frozen_graph.reader import read_graph
+from export_model.converters.formats.tensorboard import FILE_NAME, event_file
+from export_model.converters.graph.nodes import Graph, Node, TensorShape
+from export_model.exporter import export_model as export
+from export_model.exporter.export.sources import read_source
 from fixtures import path as fixture
 from tests.commands import ROOT, export_model, is_refused
 

@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 
 import export_model as public
-import exporter
-from exporter import export_model, inspect_model, load_policy, verify_bundle
-from exporter.export.pipeline import ExportResult
-from exporter.inspect.inspection import Inspection
-from exporter.verify.options import VerifyOptions
-from exporter.verify.report import ParityReport
-from fixtures import path as fixture
-from signatures.errors import (
+from export_model import exporter
+from export_model.exporter import export_model, inspect_model, load_policy, verify_bundle
+from export_model.exporter.export.pipeline import ExportResult
+from export_model.exporter.inspect.inspection import Inspection
+from export_model.exporter.verify.options import VerifyOptions
+from export_model.exporter.verify.report import ParityReport
+from export_model.signatures.errors import (
     BundleError,
     ExportModelError,
     NotAPolicyError,
@@ -24,7 +23,8 @@ from signatures.errors import (
     SourceError,
     UsageError,
 )
-from signatures.roles import Role
+from export_model.signatures.roles import Role
+from fixtures import path as fixture
 from tests.commands import export_model as command
 from tests.commands import files_in
 from tests.exporter.rehearsal import ALL, KNOWN, ActingPool, Tensors
@@ -181,7 +181,7 @@ def _wrong(kind: str, runtime: str, answer: Tensors) -> Tensors:
 @pytest.fixture
 def disagreeing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Played runtimes, one of which is wrong."""
-    for module in ("exporter.export.again", "converters.runtimes.pool"):
+    for module in ("export_model.exporter.export.again", "export_model.converters.runtimes.pool"):
         monkeypatch.setattr(f"{module}.chosen_runtimes", lambda wanted, formats: (ALL, list(KNOWN)))
         monkeypatch.setattr(f"{module}.RuntimePool", lambda: ActingPool(_wrong))
 
@@ -268,8 +268,10 @@ def test_everything_that_comes_back_is_one_line_to_look_at(tmp_path: Path) -> No
 def test_a_result_says_how_many_formats_were_looked_at(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ran: tuple[str, ...], said: str
 ) -> None:
-    monkeypatch.setattr("converters.runtimes.pool.chosen_runtimes", lambda wanted, formats: (ran, list(KNOWN)))
-    monkeypatch.setattr("converters.runtimes.pool.RuntimePool", ActingPool)
+    monkeypatch.setattr(
+        "export_model.converters.runtimes.pool.chosen_runtimes", lambda wanted, formats: (ran, list(KNOWN))
+    )
+    monkeypatch.setattr("export_model.converters.runtimes.pool.RuntimePool", ActingPool)
     (result,) = export_model(BALL, tmp_path)
     assert repr(result).startswith(f"<ExportResult 'continuous' {result.report.verdict} {said}: bytes, saved_model, ")
 

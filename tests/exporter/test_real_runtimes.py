@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from converters.files.chunks import Pieces
-from converters.formats.format import WriteOptions
-from converters.formats.registry import DEFAULTS, WRITTEN
-from converters.graph.nodes import Graph
-from converters.policy.policy import Policy
+from export_model.converters.files.chunks import Pieces
+from export_model.converters.formats.format import WriteOptions
+from export_model.converters.formats.registry import DEFAULTS, WRITTEN
+from export_model.converters.graph.nodes import Graph
+from export_model.converters.policy.policy import Policy
 from fixtures import FIXTURES
 from fixtures import path as fixture
 from tests.commands import export_model
@@ -96,7 +96,7 @@ ROOMS = {"bytes": "frozen_graph"}
 
 def plant(monkeypatch: pytest.MonkeyPatch, target: str, output: str = "action") -> None:
     """Let the writer of one format write a wrong weight."""
-    module = importlib.import_module(f"converters.formats.{ROOMS.get(target, target)}.writer")
+    module = importlib.import_module(f"export_model.converters.formats.{ROOMS.get(target, target)}.writer")
     write = module.write
 
     def wrong(policy: Policy, options: WriteOptions) -> Any:
@@ -137,7 +137,7 @@ def test_a_wrong_weight_behind_the_memory_is_found(tmp_path: Path, monkeypatch: 
 
 
 def test_an_artefact_that_its_runtime_cannot_load_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    module = importlib.import_module("converters.formats.onnx.writer")
+    module = importlib.import_module("export_model.converters.formats.onnx.writer")
     monkeypatch.setattr(module, "write", lambda policy, options: {f"{policy.name}.onnx": Pieces(b"\x08\x08\x12\x01x")})
     ran = export_model(fixture("continuous"), "-o", tmp_path, "--samples", "1")
     assert (ran.status, ran.err) == (1, "")

@@ -12,8 +12,8 @@ from types import ModuleType
 import msgspec
 import pytest
 
-from signatures.code import CodeOptions
-from signatures.fields import Record
+from export_model.signatures.code import CodeOptions
+from export_model.signatures.fields import Record
 
 PACKAGES = ("signatures", "converters", "exporter")
 

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from exporter import api
-from exporter.fleet.sources import sources_in
+from export_model.exporter import api
+from export_model.exporter.fleet.sources import sources_in
+from export_model.signatures.errors import RefusedError
 from fixtures import path as fixture
-from signatures.errors import RefusedError
 from tests.commands import export_model
 
 PLAIN = ("--to", "onnx", "--verify", "none")

@@ -11,12 +11,12 @@ from pathlib import Path
 
 import pytest
 
-from converters.files import folders
-from converters.formats.bundle import bundle, exchange
-from converters.formats.bundle.bundle import Bundle
+from export_model.converters.files import folders
+from export_model.converters.formats.bundle import bundle, exchange
+from export_model.converters.formats.bundle.bundle import Bundle
+from export_model.signatures.contract import safe_name
+from export_model.signatures.errors import BundleError, UsageError
 from fixtures import path as fixture
-from signatures.contract import safe_name
-from signatures.errors import BundleError, UsageError
 from tests.commands import Ran, export_model, files_in, python
 from tests.hostile.kills import kill
 
@@ -26,9 +26,9 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="SIGKILL is POSI
 SUICIDE = """
 import os, shutil, signal, sys
 from pathlib import Path
-from converters.formats.bundle import exchange as swap
-from converters.files.chunks import Pieces
-from exporter.cli.main import main
+from export_model.converters.formats.bundle import exchange as swap
+from export_model.converters.files.chunks import Pieces
+from export_model.exporter.cli.main import main
 
 point, *arguments = sys.argv[1:]
 kind, _, number = point.partition(":")
@@ -199,7 +199,7 @@ def test_other_systems_do_not_try_to(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 
 def test_a_libc_without_the_call_is_no_trouble(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("converters.formats.bundle.exchange.ctypes.CDLL", lambda *a, **k: object())
+    monkeypatch.setattr("export_model.converters.formats.bundle.exchange.ctypes.CDLL", lambda *a, **k: object())
     assert not exchange._exchange(tmp_path, tmp_path)
 
 
@@ -255,7 +255,7 @@ def test_a_run_that_makes_no_temporary_folder_removes_those_of_killed_ones(tmp_p
     left.mkdir()
     (left / folders.MARKER).write_bytes(folders.OURS)
     environment = {**os.environ, "TMPDIR": str(tmp_path)}
-    ran = python("-m", "exporter", "inspect", fixture("continuous"), environment=environment)
+    ran = python("-m", "export_model", "inspect", fixture("continuous"), environment=environment)
     assert ran.status == 0, ran.err
     assert not left.exists()
 
@@ -301,8 +301,8 @@ def test_a_cleaning_that_fails_is_a_warning(out: Path, monkeypatch: pytest.Monke
 #: Stops itself by a signal once its runtimes run, then once more in the middle of cleaning up.
 STOPPED = """
 import os, shutil, sys
-from converters.runtimes import pool
-from exporter.cli.main import main
+from export_model.converters.runtimes import pool
+from export_model.exporter.cli.main import main
 
 number, again, *arguments = sys.argv[1:]
 start, remove = pool.RuntimePool.start, shutil.rmtree
@@ -337,8 +337,8 @@ def test_a_signal_leaves_no_folder_and_no_traceback(number: signal.Signals, agai
 #: Loses the interrupt, as Python does where it comes in a destructor.
 LOST = """
 import os, signal, sys, time
-from converters.runtimes import pool
-from exporter.cli.main import main
+from export_model.converters.runtimes import pool
+from export_model.exporter.cli.main import main
 
 start = pool.RuntimePool.start
 def losing(self, names):

@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.files.children import process as processes
-from converters.files.children.process import RunFailedError, RuntimeProcess
-from converters.formats.registry import DEFAULTS, WRITTEN
-from converters.runtimes import pool as pools
-from converters.runtimes.javascript import node as javascript
-from converters.runtimes.pool import RuntimePool, chosen_runtimes, unverified_error
-from converters.runtimes.registry import RUNTIMES, RuntimeInfo
+from export_model.converters.files.children import process as processes
+from export_model.converters.files.children.process import RunFailedError, RuntimeProcess
+from export_model.converters.formats.registry import DEFAULTS, WRITTEN
+from export_model.converters.runtimes import pool as pools
+from export_model.converters.runtimes.javascript import node as javascript
+from export_model.converters.runtimes.pool import RuntimePool, chosen_runtimes, unverified_error
+from export_model.converters.runtimes.registry import RUNTIMES, RuntimeInfo
+from export_model.signatures.errors import RuntimeUnavailableError, UsageError
 from fixtures import path as fixture
-from signatures.errors import RuntimeUnavailableError, UsageError
 from tests.commands import ROOT
 
 NODE = {r.name: r for r in javascript.RUNTIMES}
@@ -194,7 +194,7 @@ def test_a_runtime_that_ends_at_once_is_unavailable() -> None:
 WAITS = """
 import pathlib, sys, time
 sys.path.insert(0, sys.argv[2])
-from converters.files.children.child import claim_stdout, serve
+from export_model.converters.files.children.child import claim_stdout, serve
 out = claim_stdout()
 while not pathlib.Path(sys.argv[1]).exists():
     time.sleep(0.01)

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.compiler.compile import compile_graph
-from converters.compiler.options import CompileOptions
-from converters.formats.frozen_graph.reader import read_graph
-from converters.graph.run import run_graph
-from converters.policy.policy import Policy
-from exporter.demo import FOLDER
-from exporter.export.sources import read_source
+from export_model.converters.compiler.compile import compile_graph
+from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.formats.frozen_graph.reader import read_graph
+from export_model.converters.graph.run import run_graph
+from export_model.converters.policy.policy import Policy
+from export_model.exporter.demo import FOLDER
+from export_model.exporter.export.sources import read_source
 from tests.commands import export_model
 from tests.handmade import constant, dense, graph_bytes, node, placeholder
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from exporter import __version__
-from exporter.cli.app import app
-from exporter.cli.skill import RECIPES, SCHEMAS, STATUSES
+from export_model.exporter import __version__
+from export_model.exporter.cli.app import app
+from export_model.exporter.cli.skill import RECIPES, SCHEMAS, STATUSES
 from tests.commands import export_model
 
 PAGE = export_model("skill").out

@@ -7,22 +7,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.compiler.passes.int8_products import join_products, multiply_products
-from converters.compiler.passes.weights import LEAST, Storage, are_steps, compact, round_weights
-from converters.formats.format import WriteOptions
-from converters.formats.registry import DEFAULTS, WRITTEN
-from converters.graph.nodes import Graph, Node, TensorShape
-from converters.graph.run import run_graph
-from converters.runtimes.pool import RuntimePool
-from exporter import export_model, verify_bundle
-from exporter.export.sources import read_source
-from exporter.reports.entry import of_result
-from exporter.reports.markdown import markdown_text
-from exporter.reports.page import page
-from exporter.tables import size_text
-from exporter.verify.checks import decisions as check
+from export_model.converters.compiler.passes.int8_products import join_products, multiply_products
+from export_model.converters.compiler.passes.weights import LEAST, Storage, are_steps, compact, round_weights
+from export_model.converters.formats.format import WriteOptions
+from export_model.converters.formats.registry import DEFAULTS, WRITTEN
+from export_model.converters.graph.nodes import Graph, Node, TensorShape
+from export_model.converters.graph.run import run_graph
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter import export_model, verify_bundle
+from export_model.exporter.export.sources import read_source
+from export_model.exporter.reports.entry import of_result
+from export_model.exporter.reports.markdown import markdown_text
+from export_model.exporter.reports.page import page
+from export_model.exporter.tables import size_text
+from export_model.exporter.verify.checks import decisions as check
+from export_model.signatures.errors import UsageError
 from fixtures import path as fixture
-from signatures.errors import UsageError
 
 _KEPT: tuple[Storage, ...] = ("float16", "int8")
 

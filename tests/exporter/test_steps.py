@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.files import tensorflow_messages as schema
-from converters.graph.run import run_graph
-from converters.runtimes.pool import RuntimePool
-from exporter.api import export_model as exported
-from exporter.api import inspect_model, verify_bundle
-from signatures.errors import BundleError, UsageError
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.graph.run import run_graph
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.api import export_model as exported
+from export_model.exporter.api import inspect_model, verify_bundle
+from export_model.signatures.errors import BundleError, UsageError
 from tests.checkpoint.writing import TrainingGraph, bundle, expected, policy
 from tests.commands import export_model, is_refused
 

@@ -12,7 +12,7 @@ import pytest
 from fixtures import path as fixture
 from tests.commands import ROOT
 
-PROGRAM = f"{sys.executable} -P -m exporter"
+PROGRAM = f"{sys.executable} -P -m export_model"
 
 
 def shell(line: str) -> subprocess.CompletedProcess[str]:

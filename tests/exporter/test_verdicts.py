@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.files.children.process import RunFailedError
-from exporter.verify.findings import undecided_reference
-from exporter.verify.statistics import FALSE_ALARM, same_distribution
+from export_model.converters.files.children.process import RunFailedError
+from export_model.exporter.verify.findings import undecided_reference
+from export_model.exporter.verify.statistics import FALSE_ALARM, same_distribution
 from fixtures import path as fixture
 from fixtures.trained import run_folder
 from tests.commands import export_model, is_refused

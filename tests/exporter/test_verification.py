@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from exporter.reports.summary import (
+from export_model.exporter.reports.summary import (
     failure_lines,
     parity_table,
 )
-from exporter.verify.options import VerifyOptions
-from exporter.verify.tolerances import Tolerance
-from exporter.verify.verdict import verdict
+from export_model.exporter.verify.options import VerifyOptions
+from export_model.exporter.verify.tolerances import Tolerance
+from export_model.exporter.verify.verdict import verdict
 from fixtures import FIXTURES
 from tests.exporter.rehearsal import (
     ActingPool,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from exporter.reports.summary import (
+from export_model.exporter.reports.summary import (
     comparison_table,
     failure_lines,
     not_run_line,
@@ -17,10 +17,10 @@ from exporter.reports.summary import (
     to_verify,
     whole_summary,
 )
-from exporter.verify.findings import Accepted, Failure, Finding, Numbers
-from exporter.verify.report import ParityReport
-from exporter.verify.tolerances import Tolerance
-from exporter.verify.verdict import verdict
+from export_model.exporter.verify.findings import Accepted, Failure, Finding, Numbers
+from export_model.exporter.verify.report import ParityReport
+from export_model.exporter.verify.tolerances import Tolerance
+from export_model.exporter.verify.verdict import verdict
 from tests.exporter.rehearsal import (
     Array,
     Exporting,

@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from converters.compiler.options import CompileOptions
-from converters.graph.run import run_graph
-from exporter.reports.entry import Entry
-from exporter.reports.markdown import markdown_text
-from exporter.reports.page import page
-from exporter.verify.checks.numbers import plausible
-from exporter.verify.original import Original
-from exporter.verify.verdict import verdict
-from signatures.errors import SignatureError, UnsupportedOpError
-from signatures.roles import Role
-from signatures.sampling import Case
-from signatures.spec import PolicySignature, SourceMap, TensorSpec
+from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.graph.run import run_graph
+from export_model.exporter.reports.entry import Entry
+from export_model.exporter.reports.markdown import markdown_text
+from export_model.exporter.reports.page import page
+from export_model.exporter.verify.checks.numbers import plausible
+from export_model.exporter.verify.original import Original
+from export_model.exporter.verify.verdict import verdict
+from export_model.signatures.errors import SignatureError, UnsupportedOpError
+from export_model.signatures.roles import Role
+from export_model.signatures.sampling import Case
+from export_model.signatures.spec import PolicySignature, SourceMap, TensorSpec
 from tests.exporter.rehearsal import (
     ActingPool,
     Exporting,

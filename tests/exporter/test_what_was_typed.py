@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 import pytest
 
-from exporter.cli.app import app
+from export_model.exporter.cli.app import app
 from fixtures import path as fixture
 from tests.commands import export_model
 

@@ -19,8 +19,8 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from converters.runtimes.pool import RuntimePool
-from signatures.errors import ExportModelError
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.signatures.errors import ExportModelError
 from tests.faults.families import Member, members, shared
 from tests.faults.judging import Fault, Outcome, Subject
 from tests.faults.page import totals

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from converters.files import tensorflow_messages as schema
-from converters.formats.frozen_graph.tensors import from_array, to_array
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.formats.frozen_graph.tensors import from_array, to_array
 from tests.handmade import constant, node
 
 Array = npt.NDArray[Any]

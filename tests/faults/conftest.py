@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.files import tensorflow_messages as schema
-from exporter.export.pipeline import ExportOptions, export
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.exporter.export.pipeline import ExportOptions, export
 from fixtures import path as fixture
 from tests.handmade import dense, graph_bytes, node, placeholder
 

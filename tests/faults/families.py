@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from converters.compiler.options import CompileOptions
-from converters.formats.source import ReadOptions
-from exporter.export.pipeline import ExportOptions, export
+from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.formats.source import ReadOptions
+from export_model.exporter.export.pipeline import ExportOptions, export
 from fixtures import FOLDER
 from fixtures import path as frozen
 from fixtures.trained import run_folder

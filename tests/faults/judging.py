@@ -11,25 +11,25 @@ from unittest import mock
 import numpy as np
 from msgspec.structs import replace
 
-from converters.consumers.named_files import answered_outputs
-from converters.files.chunks import Pieces
-from converters.formats.format import Artifact, Format, WriteOptions
-from converters.formats.registry import WRITTEN
-from converters.graph.nodes import node_of
-from converters.graph.ops.samplers import reseed
-from converters.graph.run import run_graph
-from converters.policy.policy import Policy
-from converters.runtimes.pool import RuntimePool
-from exporter.compare.comparison import CompareOptions, compare_artefacts
-from exporter.export import again, job
-from exporter.export.job import Job
-from exporter.export.names import Names
-from exporter.export.pipeline import Exporter
-from exporter.verify.options import VerifyOptions
-from exporter.verify.report import ParityReport
-from signatures.errors import ExportModelError, UnsupportedOpError
-from signatures.roles import Role
-from signatures.sampling import draw_typical
+from export_model.converters.consumers.named_files import answered_outputs
+from export_model.converters.files.chunks import Pieces
+from export_model.converters.formats.format import Artifact, Format, WriteOptions
+from export_model.converters.formats.registry import WRITTEN
+from export_model.converters.graph.nodes import node_of
+from export_model.converters.graph.ops.samplers import reseed
+from export_model.converters.graph.run import run_graph
+from export_model.converters.policy.policy import Policy
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.compare.comparison import CompareOptions, compare_artefacts
+from export_model.exporter.export import again, job
+from export_model.exporter.export.job import Job
+from export_model.exporter.export.names import Names
+from export_model.exporter.export.pipeline import Exporter
+from export_model.exporter.verify.options import VerifyOptions
+from export_model.exporter.verify.report import ParityReport
+from export_model.signatures.errors import ExportModelError, UnsupportedOpError
+from export_model.signatures.roles import Role
+from export_model.signatures.sampling import draw_typical
 from tests.faults.edits import ONE_MEMORY, Edit, edits
 from tests.faults.families import Member
 from tests.faults.plants import OF_ROWS, plants

@@ -12,14 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 from msgspec.structs import replace
 
-from converters.graph.builder import Builder
-from converters.graph.nodes import Graph, NameScope, Node, node_of, topological
-from converters.graph.ops.samplers import SAMPLERS
-from converters.graph.shapes import infer_types
-from converters.graph.types import FLOAT32, INT32
-from converters.policy.policy import Policy
-from signatures.roles import Role
-from signatures.spec import TensorSpec
+from export_model.converters.graph.builder import Builder
+from export_model.converters.graph.nodes import Graph, NameScope, Node, node_of, topological
+from export_model.converters.graph.ops.samplers import SAMPLERS
+from export_model.converters.graph.shapes import infer_types
+from export_model.converters.graph.types import FLOAT32, INT32
+from export_model.converters.policy.policy import Policy
+from export_model.signatures.roles import Role
+from export_model.signatures.spec import TensorSpec
 
 #: Nodes from a tensor (its right values): what stands in its place.
 Spoil = Callable[["Planter", str], str]

@@ -8,22 +8,22 @@ from pathlib import Path
 
 import pytest
 
-from converters.formats.format import WriteOptions
-from converters.formats.registry import WRITTEN
-from converters.policy.policy import Policy
-from converters.runtimes.pool import RuntimePool
-from converters.runtimes.registry import available_runtimes
-from exporter.api import verify_bundle
-from exporter.export.pipeline import ExportOptions, export
-from exporter.export.sources import read_source
-from exporter.verify.checks.agents import agents
-from exporter.verify.findings import Finding
-from exporter.verify.participants import policy_under_test
-from exporter.verify.session import Session
-from exporter.verify.verification import verify
+from export_model.converters.formats.format import WriteOptions
+from export_model.converters.formats.registry import WRITTEN
+from export_model.converters.policy.policy import Policy
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.converters.runtimes.registry import available_runtimes
+from export_model.exporter.api import verify_bundle
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.export.sources import read_source
+from export_model.exporter.verify.checks.agents import agents
+from export_model.exporter.verify.findings import Finding
+from export_model.exporter.verify.participants import policy_under_test
+from export_model.exporter.verify.session import Session
+from export_model.exporter.verify.verification import verify
+from export_model.signatures.code import CodeOptions
+from export_model.signatures.contract import Contract, Origin
 from fixtures import FOLDER, path
-from signatures.code import CodeOptions
-from signatures.contract import Contract, Origin
 from tests.hostile.zoo_bundles import rehashed
 from tests.programs.test_programs import need
 

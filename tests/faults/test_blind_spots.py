@@ -11,26 +11,26 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from converters.files import tensorflow_messages as schema
-from converters.files.children.process import LoadedModel
-from converters.formats.frozen_graph.tensors import from_array, to_array
-from converters.formats.intermediate_tensors import Sampler
-from converters.formats.registry import DEFAULTS
-from converters.runtimes.pool import RuntimePool
-from converters.runtimes.registry import RuntimeInfo
-from exporter.export.again import verify_folder
-from exporter.export.pipeline import ExportOptions, export
-from exporter.verify import work
-from exporter.verify.checks.densities import _joint
-from exporter.verify.checks.generators import seen_by, with_zeros, wrong_draws
-from exporter.verify.difference import Difference
-from exporter.verify.options import VerifyOptions
-from exporter.verify.participants import Feeds, Participant, policy_under_test
-from exporter.verify.report import ParityReport
-from exporter.verify.session import Session
-from exporter.verify.statistics import ranks
-from exporter.verify.tolerances import Tolerance
-from exporter.verify.verification import verify
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.files.children.process import LoadedModel
+from export_model.converters.formats.frozen_graph.tensors import from_array, to_array
+from export_model.converters.formats.intermediate_tensors import Sampler
+from export_model.converters.formats.registry import DEFAULTS
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.converters.runtimes.registry import RuntimeInfo
+from export_model.exporter.export.again import verify_folder
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.verify import work
+from export_model.exporter.verify.checks.densities import _joint
+from export_model.exporter.verify.checks.generators import seen_by, with_zeros, wrong_draws
+from export_model.exporter.verify.difference import Difference
+from export_model.exporter.verify.options import VerifyOptions
+from export_model.exporter.verify.participants import Feeds, Participant, policy_under_test
+from export_model.exporter.verify.report import ParityReport
+from export_model.exporter.verify.session import Session
+from export_model.exporter.verify.statistics import ranks
+from export_model.exporter.verify.tolerances import Tolerance
+from export_model.exporter.verify.verification import verify
 from fixtures import path as fixture
 from tests.faults.artefacts import FORMATS, opened
 from tests.handmade import constant, graph_bytes, node, placeholder

@@ -12,13 +12,13 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from converters.formats.registry import DEFAULTS, WRITTEN
-from exporter.export import sources
-from exporter.export.again import verify_folder
-from exporter.export.pipeline import ExportOptions, export
+from export_model.converters.formats.registry import DEFAULTS, WRITTEN
+from export_model.exporter.export import sources
+from export_model.exporter.export.again import verify_folder
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.signatures.errors import BundleError
+from export_model.signatures.spec import Memory, PolicySignature
 from fixtures import path as fixture
-from signatures.errors import BundleError
-from signatures.spec import Memory, PolicySignature
 
 Said = dict[str, Any]
 

@@ -11,12 +11,12 @@ import onnx
 import pytest
 from onnx import helper, numpy_helper
 
-from converters.compiler.options import CompileOptions
-from converters.runtimes.pool import RuntimePool
-from exporter.export.again import verify_folder
-from exporter.export.options import ExportOptions
-from exporter.export.pipeline import export
-from exporter.verify.report import ParityReport
+from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.export.again import verify_folder
+from export_model.exporter.export.options import ExportOptions
+from export_model.exporter.export.pipeline import export
+from export_model.exporter.verify.report import ParityReport
 from fixtures import path as fixture
 from tests.comparing import compare_artefacts
 from tests.faults.artefacts import opened

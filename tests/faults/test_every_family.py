@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from converters.runtimes.pool import RuntimePool
+from export_model.converters.runtimes.pool import RuntimePool
 from tests.faults.__main__ import SAMPLED, outcomes, sample
 from tests.faults.families import Member, members
 

@@ -12,23 +12,23 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.files.children.process import LoadedModel
-from converters.policy.policy import Policy
-from converters.runtimes.pool import RuntimePool
-from exporter.export.pipeline import ExportOptions, export
-from exporter.reports.entry import Entry
-from exporter.reports.junit import junit_xml
-from exporter.reports.page import page
-from exporter.reports.summary import comparison_table
-from exporter.verify.excuses import CHAOS, EXCUSES
-from exporter.verify.options import VerifyOptions
-from exporter.verify.participants import Feeds, Participant, policy_under_test
-from exporter.verify.report import ParityReport
-from exporter.verify.session import Session
-from exporter.verify.tolerances import Tolerance, ToleranceRule
-from exporter.verify.verification import verify
-from signatures.roles import Role
-from signatures.sampling import draw_cases
+from export_model.converters.files.children.process import LoadedModel
+from export_model.converters.policy.policy import Policy
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.reports.entry import Entry
+from export_model.exporter.reports.junit import junit_xml
+from export_model.exporter.reports.page import page
+from export_model.exporter.reports.summary import comparison_table
+from export_model.exporter.verify.excuses import CHAOS, EXCUSES
+from export_model.exporter.verify.options import VerifyOptions
+from export_model.exporter.verify.participants import Feeds, Participant, policy_under_test
+from export_model.exporter.verify.report import ParityReport
+from export_model.exporter.verify.session import Session
+from export_model.exporter.verify.tolerances import Tolerance, ToleranceRule
+from export_model.exporter.verify.verification import verify
+from export_model.signatures.roles import Role
+from export_model.signatures.sampling import draw_cases
 from tests.faults.test_blind_spots import KNOWN, Arrays, honest, verified
 from tests.faults.test_undetermined import logarithms, lowest
 from tests.handmade import constant, graph_bytes, node, placeholder
@@ -190,7 +190,7 @@ def test_a_number_of_which_both_have_nan_is_said(tmp_path: Path, processes: Runt
 def test_a_slow_runtime_runs_the_steps_with_memory_all_the_same(
     tmp_path: Path, processes: RuntimePool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("exporter.verify.work.SECONDS", 0)
+    monkeypatch.setattr("export_model.exporter.verify.work.SECONDS", 0)
 
     def forgets(feeds: Feeds, answers: Arrays) -> Arrays:
         return {n: a * 0 if n == "recurrent_out" else a for n, a in answers.items()}

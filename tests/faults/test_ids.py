@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.runtimes.pool import RuntimePool
-from exporter.acting.loading import load_policy
-from exporter.export.pipeline import ExportOptions, export
-from exporter.verify.participants import Feeds
-from signatures.errors import UsageError
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.acting.loading import load_policy
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.verify.participants import Feeds
+from export_model.signatures.errors import UsageError
 from tests.faults.test_blind_spots import Arrays, honest, verified
 from tests.handmade import constant, dense, graph_bytes, node, placeholder, weights
 

@@ -6,21 +6,21 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from converters.compiler.targets import FEWER_OPS, prepare
-from converters.formats.bundle.embed import runnable
-from converters.formats.saved_model.artifact import graph
-from converters.graph.nodes import node_of
-from converters.graph.run import run_graph
-from converters.policy.policy import Policy
-from converters.runtimes.pool import RuntimePool
-from converters.runtimes.registry import available_runtimes
-from exporter.export.again import verify_folder
-from exporter.verify.difference import compare
-from exporter.verify.inner_tensors import inner_tensors, outputs_read
-from exporter.verify.participants import PolicyUnderTest, participants_of
-from exporter.verify.reference import Reference
-from exporter.verify.tolerances import Tolerance
-from signatures.sampling import draw_cases
+from export_model.converters.compiler.targets import FEWER_OPS, prepare
+from export_model.converters.formats.bundle.embed import runnable
+from export_model.converters.formats.saved_model.artifact import graph
+from export_model.converters.graph.nodes import node_of
+from export_model.converters.graph.run import run_graph
+from export_model.converters.policy.policy import Policy
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.converters.runtimes.registry import available_runtimes
+from export_model.exporter.export.again import verify_folder
+from export_model.exporter.verify.difference import compare
+from export_model.exporter.verify.inner_tensors import inner_tensors, outputs_read
+from export_model.exporter.verify.participants import PolicyUnderTest, participants_of
+from export_model.exporter.verify.reference import Reference
+from export_model.exporter.verify.tolerances import Tolerance
+from export_model.signatures.sampling import draw_cases
 from tests.faults.conftest import Bundle
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("runtimes"), pytest.mark.usefixtures("runtimes")]
@@ -41,7 +41,7 @@ def policy_under_test(folder: object, monkeypatch: pytest.MonkeyPatch) -> Policy
         caught.append(replace(tested, artefacts=tested.files))  # the copies of a verification are gone after it
         raise CaughtError
 
-    monkeypatch.setattr("exporter.export.again.verify", catch)
+    monkeypatch.setattr("export_model.exporter.export.again.verify", catch)
     with pytest.raises(CaughtError):
         verify_folder(folder)  # type: ignore[arg-type]
     return caught[0]

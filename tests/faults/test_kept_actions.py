@@ -7,9 +7,9 @@ from pathlib import Path
 import onnx
 import pytest
 
-from exporter.export.again import verify_folder
-from exporter.export.options import ExportOptions
-from exporter.export.pipeline import export
+from export_model.exporter.export.again import verify_folder
+from export_model.exporter.export.options import ExportOptions
+from export_model.exporter.export.pipeline import export
 from fixtures import path as fixture
 from tests.faults.artefacts import opened
 

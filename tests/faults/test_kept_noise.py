@@ -10,13 +10,13 @@ import onnx
 import pytest
 from onnx import helper, numpy_helper
 
-from converters.compiler.options import CompileOptions
-from converters.runtimes.pool import RuntimePool
-from exporter.export.again import verify_folder
-from exporter.export.pipeline import ExportOptions, export
-from exporter.verify.options import VerifyOptions
-from exporter.verify.participants import Feeds
-from exporter.verify.report import ParityReport
+from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.export.again import verify_folder
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.verify.options import VerifyOptions
+from export_model.exporter.verify.participants import Feeds
+from export_model.exporter.verify.report import ParityReport
 from tests.comparing import compare_artefacts
 from tests.faults.artefacts import opened
 from tests.faults.test_blind_spots import Arrays, verified
@@ -126,7 +126,7 @@ def test_classes_that_every_call_draws_alike_are_met(tmp_path: Path, processes: 
 
 
 def test_a_runtime_that_shares_draws_as_the_reference_does_agrees() -> None:
-    from exporter.verify.checks.densities import _shared_otherwise
+    from export_model.exporter.verify.checks.densities import _shared_otherwise
 
     rng = np.random.default_rng(0)
     each, other = rng.standard_normal((2, 512, 2))

@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.files import tensorflow_messages as schema
-from converters.files.children.process import RunFailedError
-from converters.runtimes.pool import RuntimePool
-from exporter.export.again import verify_folder
-from exporter.export.pipeline import ExportOptions, export
-from exporter.verify.difference import compare, compare_all
-from exporter.verify.participants import Feeds
-from exporter.verify.reference import Reference
-from exporter.verify.tolerances import Tolerance
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.files.children.process import RunFailedError
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.export.again import verify_folder
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.verify.difference import compare, compare_all
+from export_model.exporter.verify.participants import Feeds
+from export_model.exporter.verify.reference import Reference
+from export_model.exporter.verify.tolerances import Tolerance
 from tests.commands import export_model
 from tests.comparing import compare_artefacts
 from tests.exporter.test_what_is_compared import _epsilon_greedy

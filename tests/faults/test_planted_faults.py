@@ -6,13 +6,13 @@ import math
 
 import pytest
 
-from converters.formats.registry import WRITTEN
-from exporter.export.again import verify_folder
-from exporter.reports.summary import failure_lines
-from exporter.verify.checks.draws import MISFED
-from exporter.verify.findings import Finding
-from exporter.verify.options import VerifyOptions
-from exporter.verify.report import ParityReport
+from export_model.converters.formats.registry import WRITTEN
+from export_model.exporter.export.again import verify_folder
+from export_model.exporter.reports.summary import failure_lines
+from export_model.exporter.verify.checks.draws import MISFED
+from export_model.exporter.verify.findings import Finding
+from export_model.exporter.verify.options import VerifyOptions
+from export_model.exporter.verify.report import ParityReport
 from tests.commands import export_model, is_refused
 from tests.faults.artefacts import FORMATS, opened
 from tests.faults.conftest import Bundle, Planted

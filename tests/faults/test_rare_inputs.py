@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from converters.files.children.process import LoadedModel
-from converters.runtimes.pool import RuntimePool
-from exporter.verify.options import VerifyOptions
-from exporter.verify.participants import Feeds
+from export_model.converters.files.children.process import LoadedModel
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.verify.options import VerifyOptions
+from export_model.exporter.verify.participants import Feeds
 from tests.faults.test_blind_spots import Arrays, honest, verified
 from tests.handmade import constant, dense, graph_bytes, node, placeholder
 

@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.formats.frozen_graph.reader import read_graph
-from converters.graph.nodes import Graph, Node, TensorShape
-from converters.graph.run import run_graph
-from converters.graph.underflow import End, Whole
-from converters.runtimes.pool import RuntimePool
-from exporter.export.pipeline import ExportOptions, export
-from exporter.verify.rounding import hull
+from export_model.converters.formats.frozen_graph.reader import read_graph
+from export_model.converters.graph.nodes import Graph, Node, TensorShape
+from export_model.converters.graph.run import run_graph
+from export_model.converters.graph.underflow import End, Whole
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.verify.rounding import hull
 from tests.faults.test_blind_spots import Arrays, Feeds, honest, verified
 from tests.handmade import constant, dense, graph_bytes, node, placeholder
 from tests.onnx_reader.models import floats, model, save

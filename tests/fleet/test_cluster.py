@@ -16,13 +16,13 @@ from typing import Any
 
 import pytest
 
-from exporter.export.names import Claim
-from exporter.export.pipeline import ExportOptions
-from exporter.fleet import cluster as fleet_cluster
-from exporter.fleet.fleet import export_fleet
-from exporter.fleet.worker import Outcome, Wanted
+from export_model.exporter.export.names import Claim
+from export_model.exporter.export.pipeline import ExportOptions
+from export_model.exporter.fleet import cluster as fleet_cluster
+from export_model.exporter.fleet.fleet import export_fleet
+from export_model.exporter.fleet.worker import Outcome, Wanted
+from export_model.signatures.errors import RuntimeUnavailableError
 from fixtures import path as fixture
-from signatures.errors import RuntimeUnavailableError
 from tests.commands import ROOT, export_model
 from tests.fleet.test_fleet import contents, lines
 

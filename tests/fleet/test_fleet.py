@@ -12,14 +12,14 @@ from typing import Any
 
 import pytest
 
-from exporter.cli.fleet import _Tally
-from exporter.export.pipeline import Exporter, ExportOptions
-from exporter.fleet.fleet import export_fleet
-from exporter.fleet.marks import mark, read_key
-from exporter.fleet.worker import Outcome
+from export_model.exporter.cli.fleet import _Tally
+from export_model.exporter.export.pipeline import Exporter, ExportOptions
+from export_model.exporter.fleet.fleet import export_fleet
+from export_model.exporter.fleet.marks import mark, read_key
+from export_model.exporter.fleet.worker import Outcome
+from export_model.signatures.errors import UsageError
 from fixtures import path as fixture
 from fixtures.trained import run_folder
-from signatures.errors import UsageError
 from tests.commands import export_model
 
 NAMES = ("continuous", "discrete", "twobrains", "visual")
@@ -168,7 +168,7 @@ def test_a_run_that_was_stopped_goes_on(sources: list[Path], tmp_path: Path) -> 
 def test_a_process_that_dies_costs_one_source(
     sources: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from exporter.fleet import fleet
+    from export_model.exporter.fleet import fleet
 
     real = fleet._Crew._receive
 

@@ -28,7 +28,7 @@ def test_an_interrupt_is_the_business_of_the_first_process(after: float, tmp_pat
     """A worker that imports its modules would end in a traceback; those that get it alone go on with their work."""
     command = subprocess.Popen(
         [
-            *(sys.executable, "-m", "exporter", "export", "--jobs", "2", "--verify", "none", "-o", tmp_path),
+            *(sys.executable, "-m", "export_model", "export", "--jobs", "2", "--verify", "none", "-o", tmp_path),
             *(fixture(name) for name in ("continuous", "discrete", "visual", "recurrent")),
         ],
         cwd=ROOT,

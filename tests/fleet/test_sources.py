@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from exporter.fleet.sources import is_many, sources_in
+from export_model.exporter.fleet.sources import is_many, sources_in
+from export_model.signatures.errors import ExportModelError
 from fixtures import path as fixture
-from signatures.errors import ExportModelError
 from tests.commands import ROOT
 
 

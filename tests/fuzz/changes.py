@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from converters.files import tensorflow_messages as schema
-from converters.formats.barracuda.format import _Parser
-from converters.formats.checkpoint.table import read_table
-from converters.formats.litert.flatbuffer import decode, encode
-from signatures.digest import sha256_hex
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.formats.barracuda.format import _Parser
+from export_model.converters.formats.checkpoint.table import read_table
+from export_model.converters.formats.litert.flatbuffer import decode, encode
+from export_model.signatures.digest import sha256_hex
 from tests.checkpoint.writing import table
 from tests.fuzz import mutation
 

@@ -17,8 +17,8 @@ from typing import Any
 
 from google.protobuf.message import DecodeError
 
-from converters.files import tensorflow_messages as schema
-from converters.formats.onnx.messages import ModelProto
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.formats.onnx.messages import ModelProto
 from tests.fuzz.seeds import READERS, mutant
 
 _MESSAGE = 11

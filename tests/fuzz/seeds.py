@@ -18,11 +18,11 @@ from typing import Any
 
 import numpy as np
 
-from converters.files import tensorflow_messages as schema
-from converters.formats.registry import WRITTEN
-from exporter.export.pipeline import ExportOptions, export
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.formats.registry import WRITTEN
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.signatures.errors import ExportModelError
 from fixtures import FOLDER, path
-from signatures.errors import ExportModelError
 from tests.checkpoint.writing import bundle as write_checkpoint
 from tests.checkpoint.writing import policy as training_policy
 from tests.fuzz import changes, hdf5, robots

@@ -22,20 +22,20 @@ from typing import Any
 
 import numpy as np
 
-from converters.formats.bundle.bundle import Bundle
-from converters.formats.keras.config import config_of, refuse_code
-from converters.formats.keras.source import build_layered
-from converters.formats.keras.weights import Groups
-from converters.formats.read import ports_of
-from converters.formats.registry import WRITTEN
-from exporter import load_policy
-from exporter.export.pipeline import ExportOptions, export
-from exporter.inspect.inspection import inspect_source, inspection_text
-from exporter.snippets.contract import read_bundle
-from exporter.snippets.registry import snippets
-from exporter.verify.golden import read_golden
-from signatures.errors import ExportModelError, SourceError, naming
-from signatures.spec import PolicySignature
+from export_model.converters.formats.bundle.bundle import Bundle
+from export_model.converters.formats.keras.config import config_of, refuse_code
+from export_model.converters.formats.keras.source import build_layered
+from export_model.converters.formats.keras.weights import Groups
+from export_model.converters.formats.read import ports_of
+from export_model.converters.formats.registry import WRITTEN
+from export_model.exporter import load_policy
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.inspect.inspection import inspect_source, inspection_text
+from export_model.exporter.snippets.contract import read_bundle
+from export_model.exporter.snippets.registry import snippets
+from export_model.exporter.verify.golden import read_golden
+from export_model.signatures.errors import ExportModelError, SourceError, naming
+from export_model.signatures.spec import PolicySignature
 from tests.fuzz.seeds import READERS, Files, mutant
 
 #: What a mutant may take: seconds of computing, bytes above what the process had when it was ready.

@@ -15,23 +15,23 @@ import numpy.typing as npt
 import pytest
 from msgspec.structs import replace
 
-from converters.files import tensorflow_messages as schema
-from converters.files.children.process import LoadedModel
-from converters.formats.format import Artifact, WriteOptions
-from converters.formats.frozen_graph.encode import encode
-from converters.formats.registry import WRITTEN
-from converters.graph.nodes import Graph, Node
-from converters.graph.run import run_graph
-from converters.graph.shapes import Types, infer_types
-from converters.graph.types import BATCH, TensorType, static_shape
-from converters.policy.policy import Policy
-from converters.runtimes.pool import RuntimePool
-from converters.runtimes.registry import available_runtimes
-from signatures.code import CodeOptions
-from signatures.contract import Contract, Origin
-from signatures.errors import UnsupportedOpError
-from signatures.roles import Role
-from signatures.spec import PolicySignature, TensorSpec
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.files.children.process import LoadedModel
+from export_model.converters.formats.format import Artifact, WriteOptions
+from export_model.converters.formats.frozen_graph.encode import encode
+from export_model.converters.formats.registry import WRITTEN
+from export_model.converters.graph.nodes import Graph, Node
+from export_model.converters.graph.run import run_graph
+from export_model.converters.graph.shapes import Types, infer_types
+from export_model.converters.graph.types import BATCH, TensorType, static_shape
+from export_model.converters.policy.policy import Policy
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.converters.runtimes.registry import available_runtimes
+from export_model.signatures.code import CodeOptions
+from export_model.signatures.contract import Contract, Origin
+from export_model.signatures.errors import UnsupportedOpError
+from export_model.signatures.roles import Role
+from export_model.signatures.spec import PolicySignature, TensorSpec
 
 Array = npt.NDArray[Any]
 

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from converters.graph.nodes import Graph, Node, TensorShape
-from converters.graph.ops.base import REQUIRED
-from converters.graph.ops.table import TABLE
+from export_model.converters.graph.nodes import Graph, Node, TensorShape
+from export_model.converters.graph.ops.base import REQUIRED
+from export_model.converters.graph.ops.table import TABLE
 
 Array = npt.NDArray[Any]
 

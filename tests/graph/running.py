@@ -6,9 +6,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from converters.graph.nodes import Graph, Node
-from converters.graph.run import run_graph
-from converters.graph.types import FLOAT32, INT32
+from export_model.converters.graph.nodes import Graph, Node
+from export_model.converters.graph.run import run_graph
+from export_model.converters.graph.types import FLOAT32, INT32
 from tests.graph.harness import Array
 from tests.graph.making import const, graph, node, placeholder
 from tests.graph.samples import f32, floats

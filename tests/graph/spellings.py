@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from converters.graph.nodes import TensorShape
-from converters.graph.types import BOOL, FLOAT32, INT64
+from export_model.converters.graph.nodes import TensorShape
+from export_model.converters.graph.types import BOOL, FLOAT32, INT64
 from tests.graph.harness import Array
 from tests.graph.samples import INF, NAN, bools, f32, floats, ints
 from tests.handmade import constant, node, placeholder

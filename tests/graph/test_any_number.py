@@ -8,16 +8,16 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from converters.compiler.options import CompileOptions
-from converters.compiler.passes.vmap_trial import check_rows
-from converters.graph.builder import Builder
-from converters.graph.nodes import NameScope, Node, TensorShape
-from converters.graph.run import run_graph
-from converters.runtimes.pool import RuntimePool
-from exporter.export.pipeline import ExportOptions, export
-from exporter.export.sources import read_source
-from signatures.errors import SignatureError
-from signatures.roles import Role
+from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.compiler.passes.vmap_trial import check_rows
+from export_model.converters.graph.builder import Builder
+from export_model.converters.graph.nodes import NameScope, Node, TensorShape
+from export_model.converters.graph.run import run_graph
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.errors import SignatureError
+from export_model.signatures.roles import Role
 from tests.handmade import NodeDef, constant, graph_bytes, node, placeholder
 
 WEIGHTS = np.random.default_rng(0).standard_normal((3, 2)).astype(np.float32)

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.graph.nodes import Graph
-from converters.graph.ops.base import axes_within, axis_within
-from converters.graph.run import run_graph
-from converters.graph.shapes import infer_types
-from signatures.errors import ExportModelError
+from export_model.converters.graph.nodes import Graph
+from export_model.converters.graph.ops.base import axes_within, axis_within
+from export_model.converters.graph.run import run_graph
+from export_model.converters.graph.shapes import infer_types
+from export_model.signatures.errors import ExportModelError
 from tests.graph.harness import Runtimes
 from tests.graph.making import const, graph, node, placeholder
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from converters.compiler.compile import compile_graph
-from converters.compiler.options import CompileOptions
-from converters.graph.nodes import Graph, Node
-from converters.graph.run import run_graph
-from converters.policy.policy import Policy
-from signatures.errors import SignatureError
-from signatures.roles import Role
+from export_model.converters.compiler.compile import compile_graph
+from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.graph.nodes import Graph, Node
+from export_model.converters.graph.run import run_graph
+from export_model.converters.policy.policy import Policy
+from export_model.signatures.errors import SignatureError
+from export_model.signatures.roles import Role
 from tests.graph.making import const, graph, node, placeholder
 
 STATE = np.array([[0.5, -1.0, 2.0], [0.1, 0.2, -0.3]], np.float32)

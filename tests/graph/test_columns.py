@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.compiler.passes.slice_of_concat import parts_for_slices
-from converters.formats.onnx import messages
-from converters.formats.onnx.peephole import pooled_first, simplify_nodes
-from converters.graph.nodes import Graph
+from export_model.converters.compiler.passes.slice_of_concat import parts_for_slices
+from export_model.converters.formats.onnx import messages
+from export_model.converters.formats.onnx.peephole import pooled_first, simplify_nodes
+from export_model.converters.graph.nodes import Graph
 from tests.graph.making import const, graph, node, ops, placeholder
 from tests.graph.running import value
 from tests.graph.samples import floats

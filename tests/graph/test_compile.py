@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from converters.compiler.compilation import Compilation, Condition
-from converters.compiler.compile import PASSES, compilations, compile_graph
-from converters.compiler.options import CompileOptions
-from converters.compiler.passes import conditions as has
-from converters.formats.frozen_graph.reader import read_graph
-from converters.graph.nodes import Graph, Node
-from converters.policy.facts import SourceFacts
-from exporter.export.sources import read_source
+from export_model.converters.compiler.compilation import Compilation, Condition
+from export_model.converters.compiler.compile import PASSES, compilations, compile_graph
+from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.compiler.passes import conditions as has
+from export_model.converters.formats.frozen_graph.reader import read_graph
+from export_model.converters.graph.nodes import Graph, Node
+from export_model.converters.policy.facts import SourceFacts
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.roles import Role
 from fixtures import FIXTURES
 from fixtures import path as fixture
-from signatures.roles import Role
 from tests.graph.harness import Runtimes, difference
 from tests.graph.making import const, graph, node, placeholder
 from tests.graph.running import values

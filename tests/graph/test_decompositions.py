@@ -7,11 +7,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from converters.compiler.passes.lowering import lower_for_importers, lower_for_nn
-from converters.consumers.profiles import PROFILES
-from converters.graph.nodes import Graph, Node
-from converters.graph.ops.table import TABLE
-from converters.graph.run import run_graph
+from export_model.converters.compiler.passes.lowering import lower_for_importers, lower_for_nn
+from export_model.converters.consumers.profiles import PROFILES
+from export_model.converters.graph.nodes import Graph, Node
+from export_model.converters.graph.ops.table import TABLE
+from export_model.converters.graph.run import run_graph
 from tests.graph.samples import SAMPLES, Sample
 
 DECOMPOSED = {name: op.barracuda for name, op in TABLE.items() if op.barracuda is not None}

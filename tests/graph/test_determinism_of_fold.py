@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.compiler.passes.fold import fold
-from converters.files import tensorflow_messages as schema
-from converters.formats.frozen_graph.encode import encode
-from converters.graph.nodes import Graph
+from export_model.converters.compiler.passes.fold import fold
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.formats.frozen_graph.encode import encode
+from export_model.converters.graph.nodes import Graph
 from tests.graph.making import const, graph, node, ops
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from converters.graph import editor as module
-from converters.graph.editor import Editor
-from converters.graph.nodes import Node
+from export_model.converters.graph import editor as module
+from export_model.converters.graph.editor import Editor
+from export_model.converters.graph.nodes import Node
 from tests.graph.making import graph, node, placeholder
 
 

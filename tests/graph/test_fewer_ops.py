@@ -10,13 +10,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pytest
 
-from converters.compiler.targets import FEWER_OPS, prepare
-from converters.graph.nodes import Graph, Node
-from converters.graph.run import run_graph
-from converters.graph.types import INT32
-from converters.policy.policy import Policy
-from signatures.roles import Role
-from signatures.spec import PolicySignature, TensorSpec
+from export_model.converters.compiler.targets import FEWER_OPS, prepare
+from export_model.converters.graph.nodes import Graph, Node
+from export_model.converters.graph.run import run_graph
+from export_model.converters.graph.types import INT32
+from export_model.converters.policy.policy import Policy
+from export_model.signatures.roles import Role
+from export_model.signatures.spec import PolicySignature, TensorSpec
 from tests.graph.harness import Runtimes, difference
 from tests.graph.making import Array, const, graph, node, ops, placeholder
 from tests.graph.samples import f32, floats

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from converters.compiler.passes.fold import fold
-from converters.graph.nodes import Graph
-from converters.graph.types import FLOAT32, INT32
+from export_model.converters.compiler.passes.fold import fold
+from export_model.converters.graph.nodes import Graph
+from export_model.converters.graph.types import FLOAT32, INT32
 from tests.graph.making import const, graph, node, ops, placeholder
 from tests.graph.running import same_values
 from tests.graph.samples import f32, floats

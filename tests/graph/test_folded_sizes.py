@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from converters.compiler.compile import compile_graph
-from converters.formats.frozen_graph.reader import read_graph
-from converters.graph.nodes import Graph
-from converters.graph.shapes import infer_types
-from converters.graph.size_limits import MAX_MADE
+from export_model.converters.compiler.compile import compile_graph
+from export_model.converters.formats.frozen_graph.reader import read_graph
+from export_model.converters.graph.nodes import Graph
+from export_model.converters.graph.shapes import infer_types
+from export_model.converters.graph.size_limits import MAX_MADE
 from tests.handmade import NodeDef, constant, graph_bytes, node, placeholder
 
 X = "vector_observation"

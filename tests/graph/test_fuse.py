@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.compiler.passes.fuse import fuse
-from converters.graph.nodes import Graph
+from export_model.converters.compiler.passes.fuse import fuse
+from export_model.converters.graph.nodes import Graph
 from tests.graph.making import const, graph, node, ops, placeholder
 from tests.graph.running import value
 from tests.graph.samples import floats

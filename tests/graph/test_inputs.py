@@ -7,12 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from converters.compiler.passes.inputs import batch_size_rank, complete_shapes, set_values, settle_inputs
-from converters.graph.nodes import Graph, Node, TensorShape
-from converters.graph.shapes import infer_types
-from converters.graph.types import FLOAT32
-from signatures.errors import UsageError
-from signatures.roles import Role
+from export_model.converters.compiler.passes.inputs import batch_size_rank, complete_shapes, set_values, settle_inputs
+from export_model.converters.graph.nodes import Graph, Node, TensorShape
+from export_model.converters.graph.shapes import infer_types
+from export_model.converters.graph.types import FLOAT32
+from export_model.signatures.errors import UsageError
+from export_model.signatures.roles import Role
 from tests.graph.making import const, graph, node, placeholder
 from tests.graph.running import value
 from tests.graph.samples import f32, floats

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from converters.compiler.passes.naming import name_tensors
-from converters.graph.nodes import Graph, Node
+from export_model.converters.compiler.passes.naming import name_tensors
+from export_model.converters.graph.nodes import Graph, Node
 from tests.graph.making import const, graph, node, placeholder
 from tests.graph.running import value
 from tests.graph.samples import floats

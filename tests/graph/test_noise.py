@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from converters.compiler.passes.noise import lift_noise, samplers, without_noise
-from converters.graph.nodes import Graph, Node, TensorShape
-from converters.graph.types import FLOAT32
-from signatures.errors import UnsupportedOpError
+from export_model.converters.compiler.passes.noise import lift_noise, samplers, without_noise
+from export_model.converters.graph.nodes import Graph, Node, TensorShape
+from export_model.converters.graph.types import FLOAT32
+from export_model.signatures.errors import UnsupportedOpError
 from tests.graph.making import const, graph, node, ops, placeholder
 from tests.graph.running import gaussian, mean, same_values, value
 from tests.graph.samples import f32, floats

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.compiler.passes.normalise import as_placeholder, normalise
-from converters.formats.frozen_graph.reader import from_graph_def
-from converters.graph.nodes import Graph, Node, TensorShape, topological
-from converters.graph.ops.table import TABLE
-from converters.graph.run import run_graph
-from converters.graph.types import FLOAT32
-from signatures.errors import GraphError, UnsupportedOpError
+from export_model.converters.compiler.passes.normalise import as_placeholder, normalise
+from export_model.converters.formats.frozen_graph.reader import from_graph_def
+from export_model.converters.graph.nodes import Graph, Node, TensorShape, topological
+from export_model.converters.graph.ops.table import TABLE
+from export_model.converters.graph.run import run_graph
+from export_model.converters.graph.types import FLOAT32
+from export_model.signatures.errors import GraphError, UnsupportedOpError
 from tests import handmade
 from tests.graph.harness import Runtimes, difference
 from tests.graph.samples import f32, floats, ints

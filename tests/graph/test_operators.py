@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from converters.graph.ops.base import written_as_older
-from converters.graph.ops.table import SPELLINGS, TABLE
+from export_model.converters.graph.ops.base import written_as_older
+from export_model.converters.graph.ops.table import SPELLINGS, TABLE
 from tests import operators
 from tests.graph.samples import SAMPLES
 from tests.operators import ONE, OPS, REFUSED, SEVERAL, WRITERS, Outcome, cell, outcomes

@@ -12,14 +12,14 @@ from collections.abc import Callable, Mapping
 import numpy as np
 import pytest
 
-from converters.formats.registry import WRITTEN
-from converters.graph.nodes import Graph, Node, TensorShape
-from converters.graph.ops.base import written_as_older
-from converters.graph.ops.samplers import reseed
-from converters.graph.ops.table import TABLE
-from converters.graph.run import run_graph
-from converters.graph.shapes import infer_types
-from signatures.errors import ExportModelError, UnsupportedOpError
+from export_model.converters.formats.registry import WRITTEN
+from export_model.converters.graph.nodes import Graph, Node, TensorShape
+from export_model.converters.graph.ops.base import written_as_older
+from export_model.converters.graph.ops.samplers import reseed
+from export_model.converters.graph.ops.table import TABLE
+from export_model.converters.graph.run import run_graph
+from export_model.converters.graph.shapes import infer_types
+from export_model.signatures.errors import ExportModelError, UnsupportedOpError
 from tests.graph.harness import Array, Bindings, Runtimes, difference, policy_of
 from tests.graph.samples import DRAWS, PROBABILITIES, SAMPLES, TFJS, Sample, random_slices
 

@@ -13,10 +13,10 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from converters.graph.nodes import Graph, Node
-from converters.graph.ops.loops.layers import window_padding
-from converters.graph.ops.table import TABLE
-from converters.graph.types import INT32
+from export_model.converters.graph.nodes import Graph, Node
+from export_model.converters.graph.ops.loops.layers import window_padding
+from export_model.converters.graph.ops.table import TABLE
+from export_model.converters.graph.types import INT32
 from tests import conftest
 from tests.graph.harness import Array, fitting
 from tests.graph.making import const, defaults, placeholder

@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.compiler.passes.fold import fold
-from converters.compiler.passes.normalise import normalise
-from converters.formats.frozen_graph.reader import from_graph_def
-from converters.graph.nodes import Graph, Node
-from converters.graph.run import run_graph
-from converters.runtimes.pool import RuntimePool
-from exporter.export.pipeline import ExportOptions, export
-from signatures.errors import GraphError, UnsupportedOpError
+from export_model.converters.compiler.passes.fold import fold
+from export_model.converters.compiler.passes.normalise import normalise
+from export_model.converters.formats.frozen_graph.reader import from_graph_def
+from export_model.converters.graph.nodes import Graph, Node
+from export_model.converters.graph.run import run_graph
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.signatures.errors import GraphError, UnsupportedOpError
 from tests import handmade
 from tests.graph.harness import Array, Runtimes, difference
 from tests.graph.samples import floats

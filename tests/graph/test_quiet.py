@@ -19,13 +19,13 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 from onnx import helper, numpy_helper
 
-from converters.compiler.passes.fold import fold
-from converters.files.tensorflow_messages import GraphDef, serialise
-from converters.graph.jitter import Jitter
-from converters.graph.nodes import Graph, Node
-from converters.graph.run import run_graph
+from export_model.converters.compiler.passes.fold import fold
+from export_model.converters.files.tensorflow_messages import GraphDef, serialise
+from export_model.converters.graph.jitter import Jitter
+from export_model.converters.graph.nodes import Graph, Node
+from export_model.converters.graph.run import run_graph
+from export_model.signatures.errors import ExportModelError
 from fixtures import path as fixture
-from signatures.errors import ExportModelError
 from tests import conftest
 from tests.commands import export_model
 from tests.graph.samples import SAMPLES, Sample

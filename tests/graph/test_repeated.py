@@ -6,12 +6,12 @@ import numpy as np
 import onnx
 import pytest
 
-from converters.compiler.passes.broadcast_constants import broadcast_rows
-from converters.consumers.profiles import profile
-from converters.formats.onnx.writer import write
-from converters.graph.nodes import Graph, Node, TensorShape
-from converters.graph.run import run_graph
-from converters.graph.types import BOOL, FLOAT32, INT32
+from export_model.converters.compiler.passes.broadcast_constants import broadcast_rows
+from export_model.converters.consumers.profiles import profile
+from export_model.converters.formats.onnx.writer import write
+from export_model.converters.graph.nodes import Graph, Node, TensorShape
+from export_model.converters.graph.run import run_graph
+from export_model.converters.graph.types import BOOL, FLOAT32, INT32
 from tests.graph.harness import policy_of
 
 pytest.importorskip("onnxruntime")

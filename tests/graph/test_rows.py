@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from converters.compiler.passes.vmap import for_every_row
-from converters.graph.nodes import Graph, Node, TensorShape
-from converters.graph.run import run_graph
-from signatures.errors import UnsupportedOpError
+from export_model.converters.compiler.passes.vmap import for_every_row
+from export_model.converters.graph.nodes import Graph, Node, TensorShape
+from export_model.converters.graph.run import run_graph
+from export_model.signatures.errors import UnsupportedOpError
 from tests.graph.samples import SAMPLES, Sample
 
 ROWS = 3

@@ -7,13 +7,13 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from converters.graph.jitter import Jitter
-from converters.graph.nodes import Graph, Node
-from converters.graph.ops.linear import matmul
-from converters.graph.ops.table import TABLE
-from converters.graph.run import run_graph
-from exporter.verify.rounding import FACTOR, RUNS
-from signatures.errors import ExportModelError, GraphError
+from export_model.converters.graph.jitter import Jitter
+from export_model.converters.graph.nodes import Graph, Node
+from export_model.converters.graph.ops.linear import matmul
+from export_model.converters.graph.ops.table import TABLE
+from export_model.converters.graph.run import run_graph
+from export_model.exporter.verify.rounding import FACTOR, RUNS
+from export_model.signatures.errors import ExportModelError, GraphError
 from tests.graph.harness import Runtimes, policy_of
 from tests.graph.making import const, graph, node, placeholder
 
@@ -94,7 +94,7 @@ def test_what_moving_each_weight_makes_is_known_of_large_ones(terms: int, monkey
         return float(np.sqrt(np.mean(np.square(moved, dtype=np.float64))))
 
     one_by_one = spread()
-    monkeypatch.setattr("converters.graph.jitter._MOST_DRAWN", 0)
+    monkeypatch.setattr("export_model.converters.graph.jitter._MOST_DRAWN", 0)
     assert 0.9 < spread() / one_by_one < 1.1
 
 
@@ -104,8 +104,8 @@ def test_a_large_product_is_computed_a_piece_at_a_time(monkeypatch: pytest.Monke
     product = TABLE["MatMul"].kernel
     assert product is not None
     whole = product(Node("y", "MatMul"), a, b)
-    monkeypatch.setattr("converters.graph.ops.linear._LARGE", 100)
-    monkeypatch.setattr("converters.graph.ops.linear._AT_ONCE", 100)
+    monkeypatch.setattr("export_model.converters.graph.ops.linear._LARGE", 100)
+    monkeypatch.setattr("export_model.converters.graph.ops.linear._AT_ONCE", 100)
     for each, other in ((Node("y", "MatMul"), b), (Node("y", "MatMul", attrs={"transpose_b": True}), b.T.copy())):
         np.testing.assert_allclose(product(each, a, other), whole, rtol=1e-6)
 
@@ -143,7 +143,7 @@ def test_what_is_moved_piece_by_piece_is_moved_as_the_whole_is(
         return [m.tobytes() for m in (*made, *jitter.results(entry, each, [left, right], [left @ right]))]
 
     pieces = moved()
-    monkeypatch.setattr("converters.graph.jitter._AT_ONCE", 1 << 30)
+    monkeypatch.setattr("export_model.converters.graph.jitter._AT_ONCE", 1 << 30)
     assert pieces == moved()
 
 
@@ -164,7 +164,7 @@ def test_what_is_not_rounded_is_not_moved(
     op: str, left: list[float], right: float, moves: list[bool], piece: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A mask's (1 - mask)·1e8 is exact: moved by one unit in the last place of 1, it would open every choice."""
-    monkeypatch.setattr("converters.graph.jitter._AT_ONCE", piece)
+    monkeypatch.setattr("export_model.converters.graph.jitter._AT_ONCE", piece)
     made = graph(placeholder("x", (None, 4)), const("c", right, np.float32), node("y", op, "x", "c"))
     feeds = {"x": np.repeat(np.float32([left]), 300, axis=0)}
     exact = run_graph(made, feeds, ["y"])["y"]
@@ -179,8 +179,8 @@ def test_a_product_of_squares_is_that_of_the_squared_operands(
     random = np.random.default_rng(2)
     a, b = random.standard_normal((3, 50)).astype(np.float32), random.standard_normal((50, 17)).astype(np.float32)
     b = b.T.copy() if turned else b
-    monkeypatch.setattr("converters.graph.ops.linear._LARGE", piece)
-    monkeypatch.setattr("converters.graph.ops.linear._AT_ONCE", piece)
+    monkeypatch.setattr("export_model.converters.graph.ops.linear._LARGE", piece)
+    monkeypatch.setattr("export_model.converters.graph.ops.linear._AT_ONCE", piece)
     each = Node("y", "MatMul", attrs={"transpose_b": turned})
     expected = matmul(each, np.square(a), np.square(b))
     assert matmul(each, a, b, squared=True).tobytes() == expected.tobytes()

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from converters.formats.frozen_graph.reader import read_graph
-from converters.graph.ops.samplers import SAMPLERS
-from exporter.export.pipeline import ExportOptions, export
-from exporter.export.sources import read_source
+from export_model.converters.formats.frozen_graph.reader import read_graph
+from export_model.converters.graph.ops.samplers import SAMPLERS
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.export.sources import read_source
 from fixtures import path as fixture
 
 

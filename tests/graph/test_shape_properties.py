@@ -11,11 +11,11 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from converters.graph.nodes import Graph, Node
-from converters.graph.run import run_graph
-from converters.graph.shapes import infer_types
-from converters.graph.types import BATCH, INT32, Dim, Symbols, broadcast
-from signatures.errors import GraphError
+from export_model.converters.graph.nodes import Graph, Node
+from export_model.converters.graph.run import run_graph
+from export_model.converters.graph.shapes import infer_types
+from export_model.converters.graph.types import BATCH, INT32, Dim, Symbols, broadcast
+from export_model.signatures.errors import GraphError
 from tests import conftest
 from tests.graph.harness import fitting
 from tests.graph.making import const, defaults, placeholder

@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.compiler.passes.normalise import normalise
-from converters.formats.format import WriteOptions
-from converters.formats.registry import WRITTEN
-from converters.graph.nodes import Graph, Node, TensorShape
-from converters.graph.shapes import infer_types
-from converters.graph.types import BOOL, FLOAT32
-from exporter.export.sources import read_source
+from export_model.converters.compiler.passes.normalise import normalise
+from export_model.converters.formats.format import WriteOptions
+from export_model.converters.formats.registry import WRITTEN
+from export_model.converters.graph.nodes import Graph, Node, TensorShape
+from export_model.converters.graph.shapes import infer_types
+from export_model.converters.graph.types import BOOL, FLOAT32
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.errors import GraphError, UnsupportedOpError
 from fixtures import path as fixture
-from signatures.errors import GraphError, UnsupportedOpError
 from tests.handmade import constant, graph_bytes, node, placeholder
 
 

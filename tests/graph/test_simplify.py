@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from converters.compiler.passes.simplify import collapse_views, drop_identities
-from converters.graph.nodes import Graph, Node
-from converters.graph.ops.table import TABLE
+from export_model.converters.compiler.passes.simplify import collapse_views, drop_identities
+from export_model.converters.graph.nodes import Graph, Node
+from export_model.converters.graph.ops.table import TABLE
 from tests.graph.harness import Array
 from tests.graph.making import const, graph, node, ops, placeholder
 from tests.graph.running import same_values

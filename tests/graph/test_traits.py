@@ -11,10 +11,19 @@ import numpy as np
 import onnx.defs
 import pytest
 
-from converters.graph.nodes import Graph, Node
-from converters.graph.ops import activations, table
-from converters.graph.ops.table import CONTROL_FLOW, FORBIDDEN, SPELLINGS, TABLE, hands_on, is_fed, passes_on, traits
-from converters.graph.run import run_graph
+from export_model.converters.graph.nodes import Graph, Node
+from export_model.converters.graph.ops import activations, table
+from export_model.converters.graph.ops.table import (
+    CONTROL_FLOW,
+    FORBIDDEN,
+    SPELLINGS,
+    TABLE,
+    hands_on,
+    is_fed,
+    passes_on,
+    traits,
+)
+from export_model.converters.graph.run import run_graph
 from tests.commands import ROOT
 from tests.graph.harness import Array
 from tests.graph.making import defaults

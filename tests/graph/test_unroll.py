@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.compiler.passes.fold import fold
-from converters.compiler.passes.inputs import set_values
-from converters.compiler.passes.normalise import normalise
-from converters.compiler.passes.unroll import MAX_TURNS, unroll
-from converters.formats.frozen_graph.reader import from_graph_def, read_graph
-from converters.graph.nodes import Graph, Node
-from converters.graph.ops.table import CONTROL_FLOW
-from converters.graph.run import run_graph
+from export_model.converters.compiler.passes.fold import fold
+from export_model.converters.compiler.passes.inputs import set_values
+from export_model.converters.compiler.passes.normalise import normalise
+from export_model.converters.compiler.passes.unroll import MAX_TURNS, unroll
+from export_model.converters.formats.frozen_graph.reader import from_graph_def, read_graph
+from export_model.converters.graph.nodes import Graph, Node
+from export_model.converters.graph.ops.table import CONTROL_FLOW
+from export_model.converters.graph.run import run_graph
+from export_model.signatures.errors import GraphError, NotAPolicyError, UnsupportedOpError
 from fixtures import path
 from fixtures.goldens import read_npz
-from signatures.errors import GraphError, NotAPolicyError, UnsupportedOpError
 from tests import handmade
 from tests.graph.harness import Array, Runtimes, difference
 from tests.graph.samples import f32, floats, ints
@@ -227,7 +227,7 @@ def test_an_array_that_is_handed_on_again_and_again_is_refused(monkeypatch: pyte
         flow = f"w{i}"
     nodes.append(node("read", "TensorArrayReadV3", "array", "i0", flow, dtype=F32))
     assert straight(nodes, "read").nodes
-    monkeypatch.setattr("converters.compiler.passes.unroll.MAX_HANDED_ON", 44)
+    monkeypatch.setattr("export_model.converters.compiler.passes.unroll.MAX_HANDED_ON", 44)
     with pytest.raises(NotAPolicyError, match="hand on more than 44"):
         straight(nodes, "read")
 

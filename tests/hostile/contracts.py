@@ -22,15 +22,15 @@ import pytest
 from hypothesis import HealthCheck, given, seed, settings
 from hypothesis import strategies as st
 
-from converters.files import tensorflow_messages as schema
-from converters.runtimes.pool import RuntimePool
-from exporter.acting.loading import load_policy
-from exporter.serve import site
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.acting.loading import load_policy
+from export_model.exporter.serve import site
+from export_model.signatures.contract import EMBEDDED
+from export_model.signatures.digest import sha256_hex
+from export_model.signatures.errors import ExportModelError
+from export_model.signatures.roles import Role
 from fixtures import path as fixture
-from signatures.contract import EMBEDDED
-from signatures.digest import sha256_hex
-from signatures.errors import ExportModelError
-from signatures.roles import Role
 from tests.commands import export_model
 
 POLICIES = ("continuous", "recurrent", "discrete", "visual", "sampled")
@@ -166,7 +166,11 @@ class Trial:
             file = write(folder, changed(content, how), graph, beyond)
             before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
             with pytest.MonkeyPatch.context() as patch:
-                for module in ("exporter.export.again", "exporter.compare.comparison", "converters.runtimes.pool"):
+                for module in (
+                    "export_model.exporter.export.again",
+                    "export_model.exporter.compare.comparison",
+                    "export_model.converters.runtimes.pool",
+                ):
                     patch.setattr(f"{module}.RuntimePool", lambda: contextlib.nullcontext(self.pool))
                 patch.setattr(site, "_vendor", lambda *_: ({}, [], []))
                 for command in _commands(folder, file, self.home, out):

@@ -21,7 +21,7 @@ from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
-from converters.formats.bundle.bundle import Bundle
+from export_model.converters.formats.bundle.bundle import Bundle
 from fixtures import path as fixture
 from tests.commands import ROOT, default_signals
 
@@ -97,7 +97,16 @@ class Kills:
             self.faults.append(f"{draw}: left {left}")
 
     def _start(self, out: Path, temporary: Path, runtimes: str, mark: str) -> subprocess.Popen[bytes]:
-        command = [sys.executable, "-m", "exporter", str(fixture("continuous")), "-o", str(out), "--verify", runtimes]
+        command = [
+            sys.executable,
+            "-m",
+            "export_model",
+            str(fixture("continuous")),
+            "-o",
+            str(out),
+            "--verify",
+            runtimes,
+        ]
         env = {**os.environ, "PYTHONPATH": str(ROOT), "TMPDIR": str(temporary), _MARK: mark}
         return subprocess.Popen(
             command,

@@ -20,9 +20,9 @@ from typing import Any
 
 import numpy as np
 
-from converters.files import tensorflow_messages as schema
-from converters.formats.barracuda.format import Layer, NnInput, NnModel
-from converters.formats.litert.flatbuffer import encode
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.formats.barracuda.format import Layer, NnInput, NnModel
+from export_model.converters.formats.litert.flatbuffer import encode
 from tests.barracuda.nn_files import write_nn
 from tests.checkpoint.writing import bundle as write_checkpoint
 from tests.checkpoint.writing import policy as training_policy
@@ -415,7 +415,9 @@ def _(folder: Path, count: int) -> Path:
 def measured(path: Path) -> tuple[float, int, str]:
     """(seconds of computing, MiB at its peak, what was said first) of ``inspect``, in a process of its own."""
     with tempfile.TemporaryFile() as said:
-        process = subprocess.Popen([sys.executable, "-m", "exporter", "inspect", str(path)], stdout=said, stderr=said)
+        process = subprocess.Popen(
+            [sys.executable, "-m", "export_model", "inspect", str(path)], stdout=said, stderr=said
+        )
         _, _, used = os.wait4(process.pid, 0)
         said.seek(0)
         first = said.readline().decode()

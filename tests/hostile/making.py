@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from converters.files import tensorflow_messages as schema
+from export_model.converters.files import tensorflow_messages as schema
 from tests.handmade import constant, graph_bytes, graph_def, node, placeholder
 
 Maker = Callable[[Path, Path], Path]

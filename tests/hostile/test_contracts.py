@@ -8,7 +8,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from converters.runtimes.pool import RuntimePool
+from export_model.converters.runtimes.pool import RuntimePool
 from tests.hostile.contracts import BEYOND, POLICIES, Trial, changes
 
 

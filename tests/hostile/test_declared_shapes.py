@@ -14,14 +14,14 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from converters.formats.registry import WRITTEN
-from exporter import export_model
+from export_model.converters.formats.registry import WRITTEN
+from export_model.exporter import export_model
 
 #: What ``inspect``, which asks all writers, may take beside the modules that it imports: bytes, seconds of processor.
 MEMORY, SECONDS = 256 << 20, 10.0
 _INSPECT = """
 import json, resource, sys
-from exporter.inspect.inspection import inspect_source
+from export_model.exporter.inspect.inspection import inspect_source
 inspect_source(sys.argv[1])
 base = resource.getrusage(resource.RUSAGE_SELF)
 try:

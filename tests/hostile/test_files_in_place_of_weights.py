@@ -16,10 +16,10 @@ import numpy as np
 import onnx
 import pytest
 
-from converters.files import fetch
-from converters.files.fetch import Fetched, read_bytes
-from converters.formats.checkpoint.tensor_bundle import Checkpoint
-from signatures.errors import SourceError
+from export_model.converters.files import fetch
+from export_model.converters.files.fetch import Fetched, read_bytes
+from export_model.converters.formats.checkpoint.tensor_bundle import Checkpoint
+from export_model.signatures.errors import SourceError
 from tests.checkpoint.writing import bundle as write_checkpoint
 from tests.checkpoint.writing import policy as training_policy
 from tests.commands import Ran, export_model

@@ -14,9 +14,7 @@ from tests.exporter.test_imports import MODULES, name_of, tree_of
 #: Modules that Python, multiprocessing and the children import early.
 NAMES = ("multiprocessing", "pickle", "runpy", "json", "struct", "numpy", "onnxruntime", "converters")
 #: What the console script does: the script's folder goes before all others, not the one that the user stands in.
-SCRIPT = (
-    f"import sys; sys.path[0] = {str(ROOT)!r}; from exporter.cli.main import main\nif __name__ == '__main__': main()"
-)
+SCRIPT = f"import sys; sys.path[0] = {str(ROOT)!r}; from export_model.exporter.cli.main import main\nif __name__ == '__main__': main()"
 
 
 def test_modules_beside_models_are_not_imported(tmp_path: Path) -> None:

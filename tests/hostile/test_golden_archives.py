@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from exporter.verify.golden import read_golden
-from signatures.errors import UsageError
-from signatures.roles import Role
-from signatures.spec import PolicySignature, TensorSpec
+from export_model.exporter.verify.golden import read_golden
+from export_model.signatures.errors import UsageError
+from export_model.signatures.roles import Role
+from export_model.signatures.spec import PolicySignature, TensorSpec
 
 SIGNATURE = PolicySignature(
     family="", action_space="continuous",

@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from converters.formats.keras.config import MAX_CONFIG, config_of, refuse_code
-from converters.formats.source import ReadOptions
-from exporter.export.sources import read_source
-from signatures.errors import DamagedFileError, NotAPolicyError
+from export_model.converters.formats.keras.config import MAX_CONFIG, config_of, refuse_code
+from export_model.converters.formats.source import ReadOptions
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.errors import DamagedFileError, NotAPolicyError
 
 DENSE = {
     "module": "keras.layers",

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.files.fetch import Fetched
-from converters.formats.keras.source import read
-from converters.formats.source import ReadOptions
-from signatures.errors import DamagedFileError, NotAPolicyError, SourceError
+from export_model.converters.files.fetch import Fetched
+from export_model.converters.formats.keras.source import read
+from export_model.converters.formats.source import ReadOptions
+from export_model.signatures.errors import DamagedFileError, NotAPolicyError, SourceError
 
 h5py = pytest.importorskip("h5py")
 

@@ -13,19 +13,19 @@ from google.protobuf.message import DecodeError
 from google.protobuf.unknown_fields import UnknownFieldSet
 from onnx import TensorProto
 
-from converters.files import message_limits as counting
-from converters.files import tensorflow_messages as schema
-from converters.files.message_limits import MAX_FIELDS, fields_of
-from converters.files.protobuf_messages import message_classes
-from converters.formats.frozen_graph.tensors import to_array
-from converters.formats.onnx.half_precision import widen
-from converters.formats.onnx.messages import ModelProto
-from converters.formats.onnx.proto import array_of, decode_model
-from exporter.export.sources import read_source
-from signatures.bounded import MAX_VALUES, loads
-from signatures.contract import json_of
-from signatures.errors import NotAPolicyError
-from signatures.fields import FieldError
+from export_model.converters.files import message_limits as counting
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.files.message_limits import MAX_FIELDS, fields_of
+from export_model.converters.files.protobuf_messages import message_classes
+from export_model.converters.formats.frozen_graph.tensors import to_array
+from export_model.converters.formats.onnx.half_precision import widen
+from export_model.converters.formats.onnx.messages import ModelProto
+from export_model.converters.formats.onnx.proto import array_of, decode_model
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.bounded import MAX_VALUES, loads
+from export_model.signatures.contract import json_of
+from export_model.signatures.errors import NotAPolicyError
+from export_model.signatures.fields import FieldError
 from tests.commands import export_model, is_refused
 from tests.fuzz.seeds import _seeds
 from tests.hostile.large import _chain

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from converters.files.chunks import Pieces
-from converters.files.file_probe import json_in
-from converters.files.tensorflow_messages import field
-from converters.formats.tfjs.artifact import safe_copy
-from exporter.export.sources import read_source
-from signatures.errors import ExportModelError
+from export_model.converters.files.chunks import Pieces
+from export_model.converters.files.file_probe import json_in
+from export_model.converters.files.tensorflow_messages import field
+from export_model.converters.formats.tfjs.artifact import safe_copy
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.errors import ExportModelError
 from tests.fuzz.changes import zipped
 from tests.handmade import continuous_policy, graph_bytes
 from tests.hostile.zoo import onnx_policy

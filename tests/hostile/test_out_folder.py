@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from converters.formats.tensorboard import FILE_NAME
-from exporter.fleet import ledger
+from export_model.converters.formats.tensorboard import FILE_NAME
+from export_model.exporter.fleet import ledger
 from fixtures import path as fixture
 from tests.commands import export_model
 

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 from onnx import TensorProto, helper, numpy_helper, save
 
-import exporter
-from converters.runtimes.javascript.node import node_executable
-from converters.runtimes.pool import RuntimePool
-from exporter.cli.terminal import say, say_json, say_lines
-from exporter.snippets.contract import string_literal
+from export_model import exporter
+from export_model.converters.runtimes.javascript.node import node_executable
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.cli.terminal import say, say_json, say_lines
+from export_model.exporter.snippets.contract import string_literal
+from export_model.signatures.errors import SourceError
 from fixtures import path as fixture
-from signatures.errors import SourceError
 from tests.commands import Ran, export_model
 from tests.handmade import continuous_policy, graph_bytes, node
 
@@ -97,7 +97,11 @@ def clean(text: str) -> None:
 def test_no_command_says_or_writes_what_acts(
     what: str, given: Path, tmp_path: Path, processes: RuntimePool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in ("exporter.export.again", "exporter.compare.comparison", "converters.runtimes.pool"):
+    for module in (
+        "export_model.exporter.export.again",
+        "export_model.exporter.compare.comparison",
+        "export_model.converters.runtimes.pool",
+    ):
         monkeypatch.setattr(f"{module}.RuntimePool", lambda: contextlib.nullcontext(processes))
     places = {"FILE": "policy.bytes", "ONNX": "policy.onnx", "FOREIGN": "foreign.bytes"}
     places |= {"TOL": "tolerances.json", "LABELS": "labels.json", "LIST": "list.txt", "NPZ": "recorded.npz"}

@@ -10,12 +10,12 @@ from typing import Any
 
 import pytest
 
-from converters.files.children.memory_limits import Memory
-from converters.formats.keras.model import tensors_in
-from converters.formats.onnx.functions import inline_functions
-from converters.trainers.stable_baselines3.spaces import space_of
-from exporter.export.sources import read_source
-from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError, UnsupportedOpError
+from export_model.converters.files.children.memory_limits import Memory
+from export_model.converters.formats.keras.model import tensors_in
+from export_model.converters.formats.onnx.functions import inline_functions
+from export_model.converters.trainers.stable_baselines3.spaces import space_of
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError, UnsupportedOpError
 
 Config = dict[str, Any]
 
@@ -88,7 +88,7 @@ def test_layers_in_any_order_are_gone_through_once(tmp_path: Path) -> None:
         return tensors_in(value)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("converters.formats.keras.network.tensors_in", count)
+        patch.setattr("export_model.converters.formats.keras.network.tensors_in", count)
         model = activations([*reversed(range(300))], names, [["a299", 0, 0]])
         (policy,) = read_source(written(model, tmp_path / "m")).policies()
     assert sum(n.op == "Relu" for n in policy.graph.nodes) == 300
@@ -103,7 +103,7 @@ def test_outputs_of_one_name_have_an_end(tmp_path: Path) -> None:
 
 
 def test_more_calls_of_layers_than_any_policy_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("converters.formats.keras.network.MAX_NODES", 2)
+    monkeypatch.setattr("export_model.converters.formats.keras.network.MAX_NODES", 2)
     model = activations([0, 1, 2], ["a", "b", "c"], [["c", 0, 0]])
     with pytest.raises(NotAPolicyError, match="called 3 times"):
         read_source(written(model, tmp_path / "m")).policies()
@@ -111,7 +111,7 @@ def test_more_calls_of_layers_than_any_policy_has(tmp_path: Path, monkeypatch: p
 
 def test_more_layers_than_any_policy_has_are_not_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A million of them took a minute before their calls were counted."""
-    monkeypatch.setattr("converters.formats.keras.model.MAX_NODES", 2)
+    monkeypatch.setattr("export_model.converters.formats.keras.model.MAX_NODES", 2)
     with pytest.raises(NotAPolicyError, match="3 layers"):
         read_source(written(activations([0, 1], ["a", "b"], [["b", 0, 0]]), tmp_path / "m")).policies()
 
@@ -156,7 +156,9 @@ def test_a_child_is_allowed_for_the_models_that_it_has() -> None:
     memory = Memory(os.getpid())
     memory._base, limits = 0, list[int]()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("converters.files.children.memory_limits._limit", lambda pid, bound: limits.append(bound))
+        patch.setattr(
+            "export_model.converters.files.children.memory_limits._limit", lambda pid, bound: limits.append(bound)
+        )
         for _ in range(3):
             memory.allow(1 << 20)
             memory.allow_for_request(0)

@@ -16,9 +16,9 @@ from pathlib import Path
 
 import pytest
 
-from converters.files.children.confinement import in_force
-from converters.formats.format import Format
-from exporter.export.pipeline import ExportOptions, export
+from export_model.converters.files.children.confinement import in_force
+from export_model.converters.formats.format import Format
+from export_model.exporter.export.pipeline import ExportOptions, export
 from fixtures import path
 from tests.commands import PLACES
 from tests.programs.test_programs import PROGRAMS, need
@@ -106,7 +106,7 @@ AS = {"as it is": (), "as a user": (*_USER, *_CAPABLE)}
 COMMAND = """
 import hashlib, json, os, sys
 from pathlib import Path
-from exporter.cli.main import main
+from export_model.exporter.cli.main import main
 file = Path(sys.argv[1])
 file.write_text(file.read_text().replace("PARENT", str(os.getpid())).replace("TERMINAL", os.ttyname(0)))
 contract = json.loads(file.with_name("policy.json").read_text())

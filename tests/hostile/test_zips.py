@@ -12,11 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from converters.files.torch_archive import Archive
-from converters.formats.keras.config import config_inside, config_of
-from converters.formats.stable_baselines3.source import _entries
-from exporter.verify.golden import read_golden
-from signatures.errors import DamagedFileError, ExportModelError
+from export_model.converters.files.torch_archive import Archive
+from export_model.converters.formats.keras.config import config_inside, config_of
+from export_model.converters.formats.stable_baselines3.source import _entries
+from export_model.exporter.verify.golden import read_golden
+from export_model.signatures.errors import DamagedFileError, ExportModelError
 from tests.hostile.test_golden_archives import SIGNATURE, header
 
 CONFIG = json.dumps({"class_name": "Sequential", "config": {}}).encode()

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from converters.runtimes.pool import RuntimePool
+from export_model.converters.runtimes.pool import RuntimePool
 from tests.commands import Ran, export_model
 from tests.handmade import continuous_policy, graph_bytes
 from tests.hostile.zoo import CASES
@@ -32,7 +32,11 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def runtimes(pool: RuntimePool, monkeypatch: pytest.MonkeyPatch) -> RuntimePool:
-    for module in ("exporter.export.again", "exporter.compare.comparison", "converters.runtimes.pool"):
+    for module in (
+        "export_model.exporter.export.again",
+        "export_model.exporter.compare.comparison",
+        "export_model.converters.runtimes.pool",
+    ):
         monkeypatch.setattr(f"{module}.RuntimePool", lambda: contextlib.nullcontext(pool))
     return pool
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from converters.files import tensorflow_messages as schema
-from signatures.digest import sha256_hex
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.signatures.digest import sha256_hex
 from tests.hostile.making import (
     case,
     elsewhere,

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from converters.files import tensorflow_messages as schema
+from export_model.converters.files import tensorflow_messages as schema
 from tests.checkpoint.writing import bundle as write_checkpoint
 from tests.checkpoint.writing import policy as training_policy
 from tests.handmade import constant, continuous_policy, graph_def, node, sampled_policy

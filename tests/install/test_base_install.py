@@ -15,9 +15,9 @@ from pathlib import Path
 
 import pytest
 
-from converters.formats.registry import DEFAULTS
-from exporter import __version__
-from exporter.export.pipeline import ExportOptions, export
+from export_model.converters.formats.registry import DEFAULTS
+from export_model.exporter import __version__
+from export_model.exporter.export.pipeline import ExportOptions, export
 from fixtures import path
 
 # One group: the environment is made once, whatever the number of test processes.
@@ -243,7 +243,7 @@ def test_the_demo_has_everything_with_it(installed: Installed) -> None:
 
 
 def test_a_module_starts_it_too(installed: Installed) -> None:
-    done = installed.run("python", "-m", "exporter", "--version")
+    done = installed.run("python", "-m", "export_model", "--version")
     assert (done.returncode, done.stdout.splitlines()[0].split()[-1]) == (0, __version__)
 
 
@@ -253,7 +253,7 @@ PROGRAM = """
 from pathlib import Path
 import numpy as np
 import export_model
-from exporter import load_policy
+from export_model.exporter import load_policy
 
 names: list[str] = [p.policy.name for p in export_model.inspect("3DBall.bytes").policies]
 read = export_model.ReadOptions(brain="Ball", inputs={"epsilon": "noise"})

@@ -13,13 +13,13 @@ from collections import Counter
 from pathlib import Path
 from random import Random
 
-from converters.formats.source import ReadOptions
-from converters.interfaces.metadata import read_metadata
-from converters.interfaces.registry import FILES as KINDS
-from converters.interfaces.registry import read_interface
-from exporter.export.sources import read_source
-from signatures.contract import parse_signature
-from signatures.errors import ExportModelError
+from export_model.converters.formats.source import ReadOptions
+from export_model.converters.interfaces.metadata import read_metadata
+from export_model.converters.interfaces.registry import FILES as KINDS
+from export_model.converters.interfaces.registry import read_interface
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.contract import parse_signature
+from export_model.signatures.errors import ExportModelError
 from tests.interfaces.made import DONE, FILES, MJLAB, SEEN, write_onnx
 
 _WORDS = (

@@ -12,8 +12,8 @@ import onnx
 import pytest
 from onnx import helper, numpy_helper
 
-from converters.compiler.passes import bake
-from signatures.contract import POLICY
+from export_model.converters.compiler.passes import bake
+from export_model.signatures.contract import POLICY
 from tests.commands import Ran, export_model
 from tests.interfaces.made import SEEN, mjlab, run_with
 

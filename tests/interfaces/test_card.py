@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from signatures.contract import PARITY, POLICY
+from export_model.signatures.contract import PARITY, POLICY
 from tests.commands import export_model
 from tests.interfaces.made import run_with
 

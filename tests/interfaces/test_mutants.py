@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from converters.interfaces.metadata import read_metadata
-from converters.interfaces.registry import read_interface
-from signatures.errors import ExportModelError
+from export_model.converters.interfaces.metadata import read_metadata
+from export_model.converters.interfaces.registry import read_interface
+from export_model.signatures.errors import ExportModelError
 from tests.interfaces.mutants import try_mutant
 
 

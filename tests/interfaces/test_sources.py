@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from converters.formats.source import ReadOptions
-from converters.interfaces.registry import FILES as KINDS
-from exporter.export.sources import read_source
-from signatures.errors import DamagedFileError
-from signatures.interface import Interface, Period, Term
-from signatures.spec import PolicySignature
+from export_model.converters.formats.source import ReadOptions
+from export_model.converters.interfaces.registry import FILES as KINDS
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.errors import DamagedFileError
+from export_model.signatures.interface import Interface, Period, Term
+from export_model.signatures.spec import PolicySignature
 from tests.commands import export_model
 from tests.interfaces.made import FILES, MJLAB, mjlab, run_with, write_onnx
 

@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from converters.formats.registry import WRITTEN
-from converters.formats.source import ReadOptions
-from exporter.export.sources import read_source
-from signatures.contract import EMBEDDED
-from signatures.interface import Interface, Period, Quantity, Statement, Term, parse_interface
+from export_model.converters.formats.registry import WRITTEN
+from export_model.converters.formats.source import ReadOptions
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.contract import EMBEDDED
+from export_model.signatures.interface import Interface, Period, Quantity, Statement, Term, parse_interface
 from tests.commands import export_model
 from tests.interfaces.made import MJLAB, mjlab, run_with
 

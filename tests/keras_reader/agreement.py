@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from converters.formats.source import SourceModel
-from converters.graph.run import run_graph
+from export_model.converters.formats.source import SourceModel
+from export_model.converters.graph.run import run_graph
 
 
 def assert_agrees(model: SourceModel, fed: Sequence[np.ndarray], wanted: Sequence[np.ndarray], where: str = "") -> None:

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.files.fetch import Fetched
-from converters.formats.keras.config import config_of
-from converters.formats.keras.layers.table import LAYERS, OPERATIONS
-from converters.formats.keras.network import UnknownLayerError
-from converters.formats.keras.source import read
-from converters.formats.source import ReadOptions
+from export_model.converters.files.fetch import Fetched
+from export_model.converters.formats.keras.config import config_of
+from export_model.converters.formats.keras.layers.table import LAYERS, OPERATIONS
+from export_model.converters.formats.keras.network import UnknownLayerError
+from export_model.converters.formats.keras.source import read
+from export_model.converters.formats.source import ReadOptions
 from tests.keras_reader.agreement import assert_agrees
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("keras_reader")]

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.formats.read import fetch, read_models
-from converters.formats.source import ReadOptions
-from converters.runtimes.javascript.node import js_home, node_executable
-from exporter.export.sources import read_source
+from export_model.converters.formats.read import fetch, read_models
+from export_model.converters.formats.source import ReadOptions
+from export_model.converters.runtimes.javascript.node import js_home, node_executable
+from export_model.exporter.export.sources import read_source
 from tests.keras_reader.agreement import assert_agrees
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("layers_models")]

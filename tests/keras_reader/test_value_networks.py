@@ -14,13 +14,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.compiler.options import CompileOptions
-from converters.formats.keras.config import loss_of
-from converters.graph.run import run_graph
-from converters.policy.policy import Policy
-from exporter.export.sources import read_source
-from signatures.errors import NotAPolicyError
-from signatures.roles import Role
+from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.formats.keras.config import loss_of
+from export_model.converters.graph.run import run_graph
+from export_model.converters.policy.policy import Policy
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.errors import NotAPolicyError
+from export_model.signatures.roles import Role
 from tests.keras_reader.conftest import ROOT
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("keras_reader")]

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from converters.runtimes.tensorflow1.install import install
-from converters.runtimes.tensorflow1.release import RELEASES, Release
-from signatures.errors import RuntimeUnavailableError
+from export_model.converters.runtimes.tensorflow1.install import install
+from export_model.converters.runtimes.tensorflow1.release import RELEASES, Release
+from export_model.signatures.errors import RuntimeUnavailableError
 
 #: A parameter per version, in a group of its own: with several test processes each is started in one of them only.
 VERSIONS = [pytest.param(r, id=r.runtime, marks=pytest.mark.xdist_group(r.runtime)) for r in RELEASES]

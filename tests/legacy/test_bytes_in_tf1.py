@@ -1,6 +1,6 @@
 """Every ``.bytes`` that is written loads and runs in the runtimes of TensorFlow 1.4 and 1.7, and agrees.
 
-Agreement is judged by exporter.verify, as in ``--verify tf1.4``: its inputs, tolerances, steps with the memory fed back
+Agreement is judged by export_model.exporter.verify, as in ``--verify tf1.4``: its inputs, tolerances, steps with the memory fed back
 and draws. The reference is numpy.
 """
 
@@ -14,17 +14,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.compiler.options import CompileOptions
-from converters.files.children.process import RunFailedError
-from converters.formats.frozen_graph.reader import read_graph
-from converters.policy.policy import Policy
-from converters.runtimes.pool import RuntimePool
-from converters.runtimes.tensorflow1.release import RELEASES
-from exporter.export.pipeline import ExportOptions, ExportResult, export
-from exporter.verify.findings import Finding
-from exporter.verify.participants import PolicyUnderTest
-from exporter.verify.session import Session
-from exporter.verify.verification import verify
+from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.files.children.process import RunFailedError
+from export_model.converters.formats.frozen_graph.reader import read_graph
+from export_model.converters.policy.policy import Policy
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.converters.runtimes.tensorflow1.release import RELEASES
+from export_model.exporter.export.pipeline import ExportOptions, ExportResult, export
+from export_model.exporter.verify.findings import Finding
+from export_model.exporter.verify.participants import PolicyUnderTest
+from export_model.exporter.verify.session import Session
+from export_model.exporter.verify.verification import verify
 from fixtures import FIXTURES, path
 from fixtures.goldens import read_npz
 from tests import known

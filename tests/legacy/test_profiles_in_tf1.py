@@ -7,15 +7,15 @@ from pathlib import Path
 
 import pytest
 
-from converters.consumers.profile import Profile
-from converters.consumers.profiles import TFSHARP
-from converters.formats.frozen_graph.reader import read_graph
-from converters.policy.policy import Policy
-from converters.runtimes.pool import RuntimePool
-from converters.runtimes.tensorflow1 import RELEASES
+from export_model.converters.consumers.profile import Profile
+from export_model.converters.consumers.profiles import TFSHARP
+from export_model.converters.formats.frozen_graph.reader import read_graph
+from export_model.converters.policy.policy import Policy
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.converters.runtimes.tensorflow1 import RELEASES
+from export_model.signatures.errors import ProfileError
 from fixtures import FIXTURES
 from fixtures import path as fixture
-from signatures.errors import ProfileError
 from tests import known
 from tests.legacy.installed import ensure
 from tests.targets.dressed import Pair, compiled

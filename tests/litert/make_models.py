@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.export.pipeline import ExportOptions, export
 from fixtures import path
 
 #: Keras layers of one input and one output: activations that the converter has operators for, or writes out.

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.formats.litert.flatbuffer import Table, encode
-from converters.formats.litert.reader import read_litert
-from converters.formats.litert.schema import BUILTINS, OPTIONS, TYPES
-from converters.graph.run import run_graph
+from export_model.converters.formats.litert.flatbuffer import Table, encode
+from export_model.converters.formats.litert.reader import read_litert
+from export_model.converters.formats.litert.schema import BUILTINS, OPTIONS, TYPES
+from export_model.converters.graph.run import run_graph
 
 interpreter = pytest.importorskip("ai_edge_litert.interpreter", reason="pip install 'export-model[litert]'")
 
@@ -73,7 +73,7 @@ def answers(model: Table, feeds: Sequence[np.ndarray], first: int = 0) -> tuple[
     runner.invoke()
     theirs = [runner.get_tensor(d["index"]) for d in runner.get_output_details()]
     found = read_litert(data)
-    from converters.compiler.passes.normalise import normalise
+    from export_model.converters.compiler.passes.normalise import normalise
 
     names = [t.name for t in found.signature.outputs.values()]
     graph = normalise(found.graph, [n.split(":")[0] for n in names])

@@ -16,19 +16,19 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from converters.formats.format import WriteOptions
-from converters.formats.registry import WRITTEN
-from converters.formats.source import ReadOptions
-from converters.policy.policy import Policy
-from converters.runtimes.pool import RuntimePool
-from exporter.export.job import contract_of
-from exporter.export.pipeline import ExportOptions, export
-from exporter.export.sources import read_source
-from exporter.reports.summary import failure_lines
-from exporter.verify.options import VerifyOptions
-from signatures.contract import safe_name
-from signatures.errors import ExportModelError
-from signatures.roles import Role
+from export_model.converters.formats.format import WriteOptions
+from export_model.converters.formats.registry import WRITTEN
+from export_model.converters.formats.source import ReadOptions
+from export_model.converters.policy.policy import Policy
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.export.job import contract_of
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.export.sources import read_source
+from export_model.exporter.reports.summary import failure_lines
+from export_model.exporter.verify.options import VerifyOptions
+from export_model.signatures.contract import safe_name
+from export_model.signatures.errors import ExportModelError
+from export_model.signatures.roles import Role
 from tests import known
 
 RUNTIMES = ("litert", "litert-plain")

@@ -8,25 +8,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.compiler.passes.weights import Storage
-from converters.files.children.process import RunFailedError
-from converters.formats.format import WriteOptions
-from converters.formats.litert.artifact import vetted
-from converters.formats.litert.flatbuffer import decode, encode
-from converters.formats.litert.schema import BUILTINS
-from converters.formats.registry import WRITTEN
-from converters.graph.nodes import Node
-from converters.graph.ops.table import TABLE
-from converters.runtimes.pool import RuntimePool
-from converters.runtimes.registry import available_runtimes
-from exporter.api import verify_bundle
-from exporter.export.pipeline import ExportOptions, ExportResult, export
-from exporter.export.sources import read_source
-from exporter.reports.summary import failure_lines
-from exporter.verify.options import VerifyOptions
+from export_model.converters.compiler.passes.weights import Storage
+from export_model.converters.files.children.process import RunFailedError
+from export_model.converters.formats.format import WriteOptions
+from export_model.converters.formats.litert.artifact import vetted
+from export_model.converters.formats.litert.flatbuffer import decode, encode
+from export_model.converters.formats.litert.schema import BUILTINS
+from export_model.converters.formats.registry import WRITTEN
+from export_model.converters.graph.nodes import Node
+from export_model.converters.graph.ops.table import TABLE
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.converters.runtimes.registry import available_runtimes
+from export_model.exporter.api import verify_bundle
+from export_model.exporter.export.pipeline import ExportOptions, ExportResult, export
+from export_model.exporter.export.sources import read_source
+from export_model.exporter.reports.summary import failure_lines
+from export_model.exporter.verify.options import VerifyOptions
+from export_model.signatures.contract import parse
+from export_model.signatures.errors import UnsupportedOpError
 from fixtures import FIXTURES, path
-from signatures.contract import parse
-from signatures.errors import UnsupportedOpError
 from tests import known
 from tests.comparing import compare_artefacts
 from tests.conftest import Chosen

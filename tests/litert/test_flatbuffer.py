@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.formats.format import WriteOptions
-from converters.formats.litert import schema
-from converters.formats.litert.flatbuffer import decode, encode
-from converters.formats.registry import WRITTEN
-from exporter.export.sources import read_source
+from export_model.converters.formats.format import WriteOptions
+from export_model.converters.formats.litert import schema
+from export_model.converters.formats.litert.flatbuffer import decode, encode
+from export_model.converters.formats.registry import WRITTEN
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.errors import DamagedFileError
 from fixtures import FIXTURES, path
-from signatures.errors import DamagedFileError
 from tests.handmade import continuous_policy, graph_bytes
 
 generated = pytest.importorskip("ai_edge_litert.schema_py_generated", reason="pip install 'export-model[litert]'")

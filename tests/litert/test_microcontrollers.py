@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from converters.formats.format import WriteOptions
-from converters.formats.litert.microcontrollers import fit
-from converters.formats.registry import WRITTEN
-from exporter.export.sources import read_source
-from exporter.inspect.inspection import inspect_source, inspection_text
+from export_model.converters.formats.format import WriteOptions
+from export_model.converters.formats.litert.microcontrollers import fit
+from export_model.converters.formats.registry import WRITTEN
+from export_model.exporter.export.sources import read_source
+from export_model.exporter.inspect.inspection import inspect_source, inspection_text
 from tests.commands import ROOT
 
 FIXTURES = ROOT / "fixtures"

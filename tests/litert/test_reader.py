@@ -13,17 +13,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from converters.formats.litert.importer.table import TABLE as OPERATORS
-from converters.formats.litert.reader import read_litert
-from converters.formats.litert.schema import BUILTINS
-from converters.graph.ops.table import TABLE
-from converters.graph.run import run_graph
-from converters.runtimes.pool import RuntimePool
-from exporter.export.pipeline import ExportOptions, export
-from exporter.export.sources import read_source
-from exporter.reports.summary import failure_lines
+from export_model.converters.formats.litert.importer.table import TABLE as OPERATORS
+from export_model.converters.formats.litert.reader import read_litert
+from export_model.converters.formats.litert.schema import BUILTINS
+from export_model.converters.graph.ops.table import TABLE
+from export_model.converters.graph.run import run_graph
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.export.sources import read_source
+from export_model.exporter.reports.summary import failure_lines
+from export_model.signatures.errors import UnsupportedOpError
 from fixtures import FIXTURES, path
-from signatures.errors import UnsupportedOpError
 from tests import known
 from tests.commands import ROOT
 from tests.conftest import Chosen

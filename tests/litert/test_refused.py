@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.formats.litert.flatbuffer import Table, decode, encode
-from converters.formats.litert.schema import BUILTINS, TYPES
-from exporter.export.sources import read_source
-from exporter.inspect.inspection import inspect_source
+from export_model.converters.formats.litert.flatbuffer import Table, decode, encode
+from export_model.converters.formats.litert.schema import BUILTINS, TYPES
+from export_model.exporter.export.sources import read_source
+from export_model.exporter.inspect.inspection import inspect_source
+from export_model.signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError, UnsupportedOpError
 from fixtures import path
-from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError, UnsupportedOpError
 from tests.litert.operators import X, floats, graph_of, model_of
 from tests.litert.sweep import written
 

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.files.children.process import RunFailedError
-from converters.runtimes.pool import RuntimePool
-from converters.runtimes.registry import available_runtimes
-from exporter.api import verify_bundle
-from exporter.export.pipeline import ExportOptions, ExportResult, export
-from exporter.reports.summary import failure_lines
+from export_model.converters.files.children.process import RunFailedError
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.converters.runtimes.registry import available_runtimes
+from export_model.exporter.api import verify_bundle
+from export_model.exporter.export.pipeline import ExportOptions, ExportResult, export
+from export_model.exporter.reports.summary import failure_lines
 from fixtures import FIXTURES, path
 from tests import known
 from tests.conftest import Chosen

@@ -8,8 +8,8 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from converters.runtimes.pool import RuntimePool
-from exporter.export import pipeline
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.export import pipeline
 
 
 @contextlib.contextmanager

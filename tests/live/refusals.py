@@ -11,8 +11,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from exporter import export_model
-from signatures.errors import ExportModelError
+from export_model.exporter import export_model
+from export_model.signatures.errors import ExportModelError
 from tests.live.train import Policy, dense, draw, tf, v1  # first: it sets up TensorFlow
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from exporter.export.sources import read_source
+from export_model.exporter.export.sources import read_source
 from fixtures import path as fixture
 from tests.commands import ROOT, python
 
@@ -62,7 +62,7 @@ def export_policies(monkeypatch: pytest.MonkeyPatch) -> tuple[Callable[..., list
     names: dict[str, Any] = {}
     exec(PROGRAMS[OLD], names)
     assert names["EXPORT_MODEL"] == ["export-model"]
-    names["EXPORT_MODEL"] = [sys.executable, "-m", "exporter"]
+    names["EXPORT_MODEL"] = [sys.executable, "-m", "export_model"]
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     return names["export_policies"], names
 

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.policy.policy import Policy
-from converters.runtimes.pool import RuntimePool
-from exporter import export_model
-from exporter.export.sources import read_source
-from signatures.errors import UsageError
+from export_model.converters.policy.policy import Policy
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter import export_model
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.errors import UsageError
 from tests.commands import files_in, python
 from tests.live.conftest import Trained
 

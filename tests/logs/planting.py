@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from exporter.acting.policy import LoadedPolicy
-from signatures.roles import Role
-from signatures.sampling import draw_typical
+from export_model.exporter.acting.policy import LoadedPolicy
+from export_model.signatures.roles import Role
+from export_model.signatures.sampling import draw_typical
 
 Array = np.ndarray
 Arrays = dict[str, Array]

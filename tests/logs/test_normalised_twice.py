@@ -15,11 +15,11 @@ import onnx
 import pytest
 from onnx import helper, numpy_helper
 
-from converters.trainers.stable_baselines3.normaliser import read_normaliser
-from exporter.acting.loading import load_policy
+from export_model.converters.trainers.stable_baselines3.normaliser import read_normaliser
+from export_model.exporter.acting.loading import load_policy
+from export_model.signatures.contract import POLICY
 from fixtures import trained
 from fixtures.sb3_zip import NORMALISED
-from signatures.contract import POLICY
 from tests.commands import export_model
 from tests.interfaces.made import write_onnx
 from tests.logs.planting import Array, Fault, recorded

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from exporter.acting.loading import load_policy
-from exporter.acting.policy import LoadedPolicy
-from exporter.logs.check import LogReport, check_log
-from signatures.roles import Role
+from export_model.exporter.acting.loading import load_policy
+from export_model.exporter.acting.policy import LoadedPolicy
+from export_model.exporter.logs.check import LogReport, check_log
+from export_model.signatures.roles import Role
 from tests.commands import ROOT
 from tests.logs.planting import Array, Arrays, Fault, recorded
 

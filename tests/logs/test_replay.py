@@ -8,9 +8,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
-from exporter.acting.loading import load_policy
-from exporter.logs.recording import NONE
-from exporter.logs.replay import SHORT, MemoryUse, Replay
+from export_model.exporter.acting.loading import load_policy
+from export_model.exporter.logs.recording import NONE
+from export_model.exporter.logs.replay import SHORT, MemoryUse, Replay
 from tests.commands import ROOT
 
 HALLWAY = ROOT / "fixtures" / "trained" / "Hallway"

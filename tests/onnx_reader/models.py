@@ -14,16 +14,16 @@ import onnx
 import pytest
 from onnx import helper, numpy_helper
 
-from converters.compiler.passes.normalise import normalise
-from converters.files import tensorflow_messages as schema
-from converters.files.children.process import LoadedModel
-from converters.files.fetch import Fetched
-from converters.formats.frozen_graph.encode import encode
-from converters.formats.onnx.reader import OnnxModel, read_onnx
-from converters.graph.nodes import Graph, Node
-from converters.graph.run import run_graph
-from converters.runtimes.pool import RuntimePool
-from converters.runtimes.registry import available_runtimes
+from export_model.converters.compiler.passes.normalise import normalise
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.files.children.process import LoadedModel
+from export_model.converters.files.fetch import Fetched
+from export_model.converters.formats.frozen_graph.encode import encode
+from export_model.converters.formats.onnx.reader import OnnxModel, read_onnx
+from export_model.converters.graph.nodes import Graph, Node
+from export_model.converters.graph.run import run_graph
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.converters.runtimes.registry import available_runtimes
 
 Array = npt.NDArray[Any]
 Dims = Sequence[int | str]

@@ -22,16 +22,16 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from converters.compiler.options import CompileOptions
-from converters.files.children.process import RunFailedError
-from converters.formats.format import WriteOptions
-from converters.formats.registry import WRITTEN
-from converters.graph.run import run_graph
-from converters.policy.policy import Policy
-from converters.runtimes.pool import RuntimePool
-from exporter.export.sources import read_source
-from signatures.errors import ExportModelError
-from signatures.roles import Role
+from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.files.children.process import RunFailedError
+from export_model.converters.formats.format import WriteOptions
+from export_model.converters.formats.registry import WRITTEN
+from export_model.converters.graph.run import run_graph
+from export_model.converters.policy.policy import Policy
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.errors import ExportModelError
+from export_model.signatures.roles import Role
 from tests.commands import ROOT
 
 PAGE = ROOT / "docs/onnx-operators.md"

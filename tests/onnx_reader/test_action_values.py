@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.compiler.options import CompileOptions
-from converters.policy.action_values import EVIDENCE
-from converters.policy.policy import Policy
-from exporter import load_policy
-from exporter.export.pipeline import ExportOptions, export
-from exporter.export.sources import read_source
-from exporter.reports.summary import failure_lines
-from signatures.errors import ExportModelError, NotAPolicyError, SignatureError, UsageError
-from signatures.roles import Role
+from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.policy.action_values import EVIDENCE
+from export_model.converters.policy.policy import Policy
+from export_model.exporter import load_policy
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.export.sources import read_source
+from export_model.exporter.reports.summary import failure_lines
+from export_model.signatures.errors import ExportModelError, NotAPolicyError, SignatureError, UsageError
+from export_model.signatures.roles import Role
 from tests.onnx_reader.models import Bench, floats, model, node, save
 
 pytestmark = pytest.mark.xdist_group("onnx-policies")

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from converters.files.fetch import Fetched
-from converters.formats.onnx.reader import read_onnx
-from converters.formats.source import ReadOptions
-from exporter.export.sources import read_source
+from export_model.converters.files.fetch import Fetched
+from export_model.converters.formats.onnx.reader import read_onnx
+from export_model.converters.formats.source import ReadOptions
+from export_model.exporter.export.sources import read_source
 from tests.graph.test_axes import HUGE, ROOM, peak
 
 

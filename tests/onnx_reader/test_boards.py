@@ -14,12 +14,12 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from converters.compiler.options import CompileOptions
-from converters.policy.policy import Policy
-from exporter.export.pipeline import ExportOptions, export
-from exporter.export.sources import read_source
-from exporter.reports.summary import failure_lines
-from signatures.roles import Role
+from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.policy.policy import Policy
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.export.sources import read_source
+from export_model.exporter.reports.summary import failure_lines
+from export_model.signatures.roles import Role
 from tests.onnx_reader.models import Bench, floats, model, node, save
 
 pytestmark = pytest.mark.xdist_group("onnx-policies")

@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
-from exporter.export.pipeline import ExportOptions, export
-from exporter.export.sources import read_source
-from exporter.reports.summary import failure_lines
-from exporter.verify.options import VerifyOptions
-from exporter.verify.tolerances import Tolerance
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.export.sources import read_source
+from export_model.exporter.reports.summary import failure_lines
+from export_model.exporter.verify.options import VerifyOptions
+from export_model.exporter.verify.tolerances import Tolerance
 from tests import known
 from tests.conftest import NEEDED, Chosen, formats_in
 from tests.corpus.conftest import SHARED

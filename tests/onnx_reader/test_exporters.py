@@ -9,11 +9,11 @@ import onnx
 import pytest
 
 import export_model
-from converters.formats.onnx.exporters import FAULTS
-from converters.formats.source import ReadOptions
-from converters.runtimes.pool import RuntimePool
-from exporter.export.sources import read_source
-from signatures.errors import UsageError
+from export_model.converters.formats.onnx.exporters import FAULTS
+from export_model.converters.formats.source import ReadOptions
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.errors import UsageError
 from tests.comparing import compare_artefacts
 
 FIXTURES = Path(__file__).resolve().parents[2] / "fixtures"

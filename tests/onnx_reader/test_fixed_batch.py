@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.formats.onnx.importer.fixed_batch import FixedBatch
-from converters.graph.types import BATCH, Symbols
-from exporter.export.pipeline import ExportOptions, export
-from exporter.reports.summary import failure_lines
+from export_model.converters.formats.onnx.importer.fixed_batch import FixedBatch
+from export_model.converters.graph.types import BATCH, Symbols
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.reports.summary import failure_lines
 from tests.onnx_reader.models import Bench, floats, model, node
 
 pytestmark = pytest.mark.xdist_group("onnx-policies")

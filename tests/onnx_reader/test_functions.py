@@ -12,8 +12,8 @@ import onnx
 import onnx.parser
 import pytest
 
-from converters.formats.onnx.functions import inline_functions
-from signatures.errors import DamagedFileError, UnsupportedOpError
+from export_model.converters.formats.onnx.functions import inline_functions
+from export_model.signatures.errors import DamagedFileError, UnsupportedOpError
 from tests.onnx_reader.models import Bench, floats, helper, imported, model, node, read
 
 OPSETS = [helper.make_opsetid("", 18), helper.make_opsetid("own", 1)]
@@ -188,7 +188,7 @@ def test_a_function_that_calls_itself_is_refused(tmp_path: Path) -> None:
 
 def test_an_op_that_onnx_defines_by_others_is_inlined(bench: Bench) -> None:
     """MeanVarianceNormalization has no entry of its own in the importer's table."""
-    from converters.formats.onnx.importer.table import TABLE
+    from export_model.converters.formats.onnx.importer.table import TABLE
 
     assert ("", "MeanVarianceNormalization") not in TABLE
     images = {"x": (np.float32, ["batch", 3, 4, 5])}

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.policy.policy import Policy
-from exporter.export.pipeline import ExportOptions, export
-from exporter.export.sources import read_source
-from exporter.reports.summary import failure_lines
+from export_model.converters.policy.policy import Policy
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.export.sources import read_source
+from export_model.exporter.reports.summary import failure_lines
 from tests.onnx_reader.mlagents import ACTIONS, HIDDEN, OBS, policy
 from tests.onnx_reader.models import Bench, floats, helper, node, save
 

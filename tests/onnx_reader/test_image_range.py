@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from exporter.export.pipeline import ExportOptions, export
-from exporter.export.sources import read_source
-from exporter.inspect.inspection import inspect_source, inspection_text
-from exporter.reports.summary import failure_lines
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.export.sources import read_source
+from export_model.exporter.inspect.inspection import inspect_source, inspection_text
+from export_model.exporter.reports.summary import failure_lines
+from export_model.signatures.sampling import draw_cases
 from fixtures import path as fixture
-from signatures.sampling import draw_cases
 from tests.onnx_reader.models import Array, Bench, constant, model, node, save
 
 pytestmark = pytest.mark.xdist_group("onnx-policies")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from converters.formats.onnx.importer.table import TABLE
+from export_model.converters.formats.onnx.importer.table import TABLE
 from tests.onnx_reader.cases import arrays, choosing, elementwise, images, layers, linear
 from tests.onnx_reader.models import Array, Bench, Case, imported, referenced
 

@@ -6,7 +6,7 @@ import onnx
 import pytest
 from google.protobuf.descriptor import FieldDescriptor
 
-from converters.formats.onnx.messages import ModelProto
+from export_model.converters.formats.onnx.messages import ModelProto
 
 #: Where ours is called otherwise: messages that are nested in another, and an enum is a number.
 THEIRS = {"Dimension": "TensorShapeProto.Dimension"} | {

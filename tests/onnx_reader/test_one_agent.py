@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from exporter.export.pipeline import ExportOptions, ExportResult, export
-from exporter.reports.summary import failure_lines
+from export_model.exporter.export.pipeline import ExportOptions, ExportResult, export
+from export_model.exporter.reports.summary import failure_lines
 from tests.onnx_reader.models import Bench, floats, model, node
 
 F = np.float32
@@ -118,7 +118,7 @@ def test_half_and_double_precision_are_computed_in_float32(kind: int, bench: Ben
 
 
 def test_halves_are_read_as_the_numbers_that_they_are() -> None:
-    from converters.formats.onnx.half_precision import widen
+    from export_model.converters.formats.onnx.half_precision import widen
 
     values = np.array([1.5, -2.25, 65504.0, 6e-8], np.float16)
     message = model([node("Add", ["x", "c"])], {"x": (np.float16, ["batch", 4])}, ("y",), {"c": values})

@@ -7,16 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.files.children.process import RuntimeProcess
-from converters.formats.frozen_graph.writer import frozen_graph
-from converters.graph.run import run_graph
-from converters.runtimes.pool import RuntimePool
-from exporter.export.sources import read_source
-from exporter.verify.difference import compare, floor_log_probs
-from exporter.verify.tolerances import Tolerance
+from export_model.converters.files.children.process import RuntimeProcess
+from export_model.converters.formats.frozen_graph.writer import frozen_graph
+from export_model.converters.graph.run import run_graph
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.export.sources import read_source
+from export_model.exporter.verify.difference import compare, floor_log_probs
+from export_model.exporter.verify.tolerances import Tolerance
+from export_model.signatures.roles import Role
+from export_model.signatures.sampling import FAR_CASES, draw_cases
 from fixtures.sb3 import FOLDER, POLICIES
-from signatures.roles import Role
-from signatures.sampling import FAR_CASES, draw_cases
 from tests.corpus.conftest import SHARED
 from tests.legacy.installed import VERSIONS, ensure
 

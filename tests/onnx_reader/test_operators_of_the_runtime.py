@@ -14,8 +14,8 @@ import onnx
 import pytest
 from onnx import helper
 
-from converters.formats.onnx.vetted import COMPUTING, self_contained_model
-from signatures.errors import UnsupportedOpError
+from export_model.converters.formats.onnx.vetted import COMPUTING, self_contained_model
+from export_model.signatures.errors import UnsupportedOpError
 from tests.onnx_reader.models import floats, model, node
 
 IN = {"obs": (np.float32, ["batch", 3])}

@@ -8,16 +8,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.compiler.options import CompileOptions
-from converters.graph.run import run_graph
-from converters.policy.policy import Policy
-from exporter.export.pipeline import ExportOptions, export
-from exporter.export.sources import read_source
-from exporter.reports.summary import failure_lines
+from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.graph.run import run_graph
+from export_model.converters.policy.policy import Policy
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.export.sources import read_source
+from export_model.exporter.reports.summary import failure_lines
+from export_model.signatures.errors import SignatureError, UsageError
+from export_model.signatures.roles import Role
 from fixtures.goldens import read_npz
 from fixtures.sb3 import FOLDER, POLICIES
-from signatures.errors import SignatureError, UsageError
-from signatures.roles import Role
 from tests.onnx_reader.models import Bench, floats, model, node, save
 
 pytestmark = pytest.mark.xdist_group("onnx-policies")

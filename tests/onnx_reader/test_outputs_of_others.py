@@ -9,13 +9,13 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from converters.graph.run import run_graph
-from converters.policy.memories import looks_like_state, stem_of
-from converters.policy.policy import Policy
-from exporter import export_model, load_policy
-from exporter.export.sources import read_source
-from signatures.errors import SignatureError
-from signatures.roles import Role
+from export_model.converters.graph.run import run_graph
+from export_model.converters.policy.memories import looks_like_state, stem_of
+from export_model.converters.policy.policy import Policy
+from export_model.exporter import export_model, load_policy
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.errors import SignatureError
+from export_model.signatures.roles import Role
 
 WEIGHTS = np.random.default_rng(0).normal(size=(3, 3)).astype(np.float32)
 

@@ -10,19 +10,19 @@ import numpy as np
 import onnx
 import pytest
 
-from converters.compiler.options import CompileOptions
-from converters.formats.format import WriteOptions
-from converters.formats.onnx.writer import write
-from converters.graph.run import run_graph
-from converters.policy.policy import Policy
-from exporter.export.pipeline import ExportOptions, export
-from exporter.export.sources import read_source
-from exporter.reports.summary import failure_lines
+from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.formats.format import WriteOptions
+from export_model.converters.formats.onnx.writer import write
+from export_model.converters.graph.run import run_graph
+from export_model.converters.policy.policy import Policy
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.export.sources import read_source
+from export_model.exporter.reports.summary import failure_lines
+from export_model.signatures.contract import EMBEDDED, Contract, Origin
+from export_model.signatures.errors import DamagedFileError
+from export_model.signatures.roles import Role
+from export_model.signatures.sampling import draw_cases
 from fixtures import FIXTURES, path
-from signatures.contract import EMBEDDED, Contract, Origin
-from signatures.errors import DamagedFileError
-from signatures.roles import Role
-from signatures.sampling import draw_cases
 from tests.onnx_reader.mlagents import policy as mlagents
 from tests.onnx_reader.models import Bench, save
 

@@ -12,10 +12,16 @@ import onnx
 import pytest
 from onnx import TensorProto, numpy_helper
 
-from converters.files.fetch import Fetched
-from converters.formats.onnx.reader import read_onnx
-from exporter.export.sources import read_source
-from signatures.errors import DamagedFileError, ExportModelError, GraphError, NotAPolicyError, UnsupportedOpError
+from export_model.converters.files.fetch import Fetched
+from export_model.converters.formats.onnx.reader import read_onnx
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.errors import (
+    DamagedFileError,
+    ExportModelError,
+    GraphError,
+    NotAPolicyError,
+    UnsupportedOpError,
+)
 from tests.onnx_reader.models import Array, constant, declared, floats, helper, model, node, read, save
 
 X = {"x": (np.float32, ["batch", 4])}

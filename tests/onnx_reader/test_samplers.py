@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.formats.onnx import edit
-from converters.formats.onnx.vetted import self_contained_model
-from converters.graph.ops.samplers import reseed
-from converters.graph.run import run_graph
-from exporter.verify.statistics import fit
+from export_model.converters.formats.onnx import edit
+from export_model.converters.formats.onnx.vetted import self_contained_model
+from export_model.converters.graph.ops.samplers import reseed
+from export_model.converters.graph.run import run_graph
+from export_model.exporter.verify.statistics import fit
 from tests.onnx_reader.models import Array, Bench, constant, floats, imported_graph, model, node, read
 
 X = floats(4, 3)

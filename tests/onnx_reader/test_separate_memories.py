@@ -16,21 +16,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from converters.compiler.options import CompileOptions
-from converters.formats.onnx.memories import FoundMemories, separate_memories
-from converters.graph.run import run_graph
-from converters.policy.policy import Policy
-from converters.runtimes.pool import RuntimePool
-from exporter.api import verify_bundle
-from exporter.export.pipeline import ExportOptions, ExportResult, export
-from exporter.export.sources import read_source
-from exporter.reports.summary import failure_lines
-from exporter.verify import original
-from signatures.contract import parse_source_map
-from signatures.errors import SignatureError
-from signatures.memories import SourcePart, join_memory, split_memory
-from signatures.roles import Role
-from signatures.spec import Memory
+from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.formats.onnx.memories import FoundMemories, separate_memories
+from export_model.converters.graph.run import run_graph
+from export_model.converters.policy.policy import Policy
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.api import verify_bundle
+from export_model.exporter.export.pipeline import ExportOptions, ExportResult, export
+from export_model.exporter.export.sources import read_source
+from export_model.exporter.reports.summary import failure_lines
+from export_model.exporter.verify import original
+from export_model.signatures.contract import parse_source_map
+from export_model.signatures.errors import SignatureError
+from export_model.signatures.memories import SourcePart, join_memory, split_memory
+from export_model.signatures.roles import Role
+from export_model.signatures.spec import Memory
 from tests.onnx_reader.models import Array, Bench, floats, model, node, save
 
 pytestmark = pytest.mark.xdist_group("onnx-policies")

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.compiler.passes.transposes import cancel_transposes
-from converters.graph.editor import Editor
-from converters.graph.nodes import Graph, Node, TensorShape
-from converters.graph.run import run_graph
+from export_model.converters.compiler.passes.transposes import cancel_transposes
+from export_model.converters.graph.editor import Editor
+from export_model.converters.graph.nodes import Graph, Node, TensorShape
+from export_model.converters.graph.run import run_graph
 from tests.onnx_reader.models import Array, floats
 
 NHWC, NCHW = [0, 2, 3, 1], [0, 3, 1, 2]

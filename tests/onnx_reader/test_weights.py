@@ -10,11 +10,11 @@ import onnx
 import pytest
 from onnx import helper, numpy_helper
 
-from converters.files.fetch import Fetched
-from converters.formats.onnx import proto
-from converters.formats.onnx.reader import read_onnx
-from converters.formats.onnx.vetted import safe_copy, self_contained_model
-from signatures.errors import DamagedFileError, UnsupportedOpError
+from export_model.converters.files.fetch import Fetched
+from export_model.converters.formats.onnx import proto
+from export_model.converters.formats.onnx.reader import read_onnx
+from export_model.converters.formats.onnx.vetted import safe_copy, self_contained_model
+from export_model.signatures.errors import DamagedFileError, UnsupportedOpError
 from tests.onnx_reader.models import constant, floats, model, node
 
 W = floats(8, 256).astype(np.float16)

@@ -6,13 +6,13 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from converters.policy.policy import Policy
-from exporter.verify.difference import compare, ties
-from exporter.verify.excuses import TIE
-from exporter.verify.reference import random_outputs
-from exporter.verify.tolerances import Tolerance, tolerance_for
-from signatures.roles import Role
-from signatures.sampling import FAR_CASES, draw_cases
+from export_model.converters.policy.policy import Policy
+from export_model.exporter.verify.difference import compare, ties
+from export_model.exporter.verify.excuses import TIE
+from export_model.exporter.verify.reference import random_outputs
+from export_model.exporter.verify.tolerances import Tolerance, tolerance_for
+from export_model.signatures.roles import Role
+from export_model.signatures.sampling import FAR_CASES, draw_cases
 
 Run = Callable[[Mapping[str, np.ndarray], Sequence[str]], Mapping[str, np.ndarray]]
 

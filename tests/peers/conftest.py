@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from exporter.export.pipeline import ExportOptions, ExportResult, export
+from export_model.exporter.export.pipeline import ExportOptions, ExportResult, export
 from fixtures import FIXTURES, path
 from tests.peers.environment import HOW, Peers, PeersUnavailableError, ensure_peers, environment
 

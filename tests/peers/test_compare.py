@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.formats.frozen_graph.encode import encode
-from converters.graph.nodes import Graph, Node, TensorShape
-from converters.runtimes.pool import RuntimePool
-from exporter.export.pipeline import ExportResult
-from signatures.roles import Role
+from export_model.converters.formats.frozen_graph.encode import encode
+from export_model.converters.graph.nodes import Graph, Node, TensorShape
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.export.pipeline import ExportResult
+from export_model.signatures.roles import Role
 from tests.comparing import compare_artefacts
 from tests.peers.agreement import POLICIES
 from tests.peers.conftest import Theirs

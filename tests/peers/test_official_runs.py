@@ -12,19 +12,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.compiler.compile import compile_graph
-from converters.compiler.targets import SAVED_MODEL, prepare
-from converters.formats.format import WriteOptions
-from converters.formats.registry import SAVED_MODEL as FORMAT
-from converters.graph.builder import Builder
-from converters.graph.nn.activations import NAMED, gelu
-from converters.graph.nodes import Graph, NameScope, Node, TensorShape
-from converters.graph.run import run_graph
-from converters.runtimes.pool import RuntimePool
-from exporter.export.pipeline import ExportOptions, export
-from exporter.verify.options import VerifyOptions
+from export_model.converters.compiler.compile import compile_graph
+from export_model.converters.compiler.targets import SAVED_MODEL, prepare
+from export_model.converters.formats.format import WriteOptions
+from export_model.converters.formats.registry import SAVED_MODEL as FORMAT
+from export_model.converters.graph.builder import Builder
+from export_model.converters.graph.nn.activations import NAMED, gelu
+from export_model.converters.graph.nodes import Graph, NameScope, Node, TensorShape
+from export_model.converters.graph.run import run_graph
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.verify.options import VerifyOptions
+from export_model.signatures.sampling import draw_cases
 from fixtures import FOLDER
-from signatures.sampling import draw_cases
 from tests.comparing import compare_artefacts
 from tests.peers.conftest import resident
 from tests.peers.environment import Peers

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.files.children.process import RuntimeProcess
-from converters.runtimes.pool import RuntimePool
-from converters.runtimes.registry import available_runtimes
-from exporter.export.pipeline import ExportResult
+from export_model.converters.files.children.process import RuntimeProcess
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.converters.runtimes.registry import available_runtimes
+from export_model.exporter.export.pipeline import ExportResult
 from tests.peers.agreement import POLICIES, disagreements
 from tests.peers.conftest import Theirs
 from tests.peers.environment import Peers

@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pytest
 
-from converters.files.children.process import LoadedModel, RuntimeProcess
-from converters.runtimes.pool import RuntimePool
-from converters.runtimes.registry import available_runtimes
-from exporter.export.pipeline import ExportResult
+from export_model.converters.files.children.process import LoadedModel, RuntimeProcess
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.converters.runtimes.registry import available_runtimes
+from export_model.exporter.export.pipeline import ExportResult
 from tests.peers.agreement import POLICIES, Run, disagreements
 from tests.peers.conftest import Theirs
 

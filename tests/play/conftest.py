@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from converters.runtimes.pool import RuntimePool
-from exporter import export_model
-from exporter.play.play import play_policy
-from exporter.play.report import PlayReport
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter import export_model
+from export_model.exporter.play.play import play_policy
+from export_model.exporter.play.report import PlayReport
 from fixtures import trained
 from tests.reports.validation import check_play
 

@@ -24,14 +24,14 @@ from typing import Any
 import numpy as np
 from msgspec import Struct
 
-from exporter import export_model
-from exporter.acting.loading import load_policy
-from exporter.play.episodes import Episodes, play_episodes
-from exporter.play.equivalence import Equivalence
-from exporter.play.match import decide, seed_of
-from exporter.play.named import world_maker
-from exporter.play.options import PlayOptions
-from exporter.verify.plays import DIFFERENT, NOT_DECIDED
+from export_model.exporter import export_model
+from export_model.exporter.acting.loading import load_policy
+from export_model.exporter.play.episodes import Episodes, play_episodes
+from export_model.exporter.play.equivalence import Equivalence
+from export_model.exporter.play.match import decide, seed_of
+from export_model.exporter.play.named import world_maker
+from export_model.exporter.play.options import PlayOptions
+from export_model.exporter.verify.plays import DIFFERENT, NOT_DECIDED
 from fixtures import gym, trained
 
 Array = np.ndarray

@@ -10,11 +10,11 @@ import onnx
 import pytest
 from msgspec.structs import replace
 
-from exporter.play.documents import html, junit, markdown
-from exporter.play.options import PlayOptions
-from exporter.play.report import PlayReport
-from exporter.verify.options import VerifyOptions
-from exporter.verify.plays import DIFFERENT, EQUIVALENT, NOT_DECIDED
+from export_model.exporter.play.documents import html, junit, markdown
+from export_model.exporter.play.options import PlayOptions
+from export_model.exporter.play.report import PlayReport
+from export_model.exporter.verify.options import VerifyOptions
+from export_model.exporter.verify.plays import DIFFERENT, EQUIVALENT, NOT_DECIDED
 from tests.commands import export_model, is_refused
 from tests.play.conftest import FEW, Play
 from tests.play.faults import order, through

@@ -7,8 +7,8 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from exporter.play.episodes import Episodes
-from exporter.play.equivalence import (
+from export_model.exporter.play.episodes import Episodes
+from export_model.exporter.play.equivalence import (
     Equivalence,
     Margin,
     equivalence,
@@ -18,11 +18,11 @@ from exporter.play.equivalence import (
     scale_of,
     share_error,
 )
-from exporter.play.match import decide
-from exporter.play.options import PlayOptions
-from exporter.play.student import t_quantile, upper_tail
-from exporter.verify.plays import DIFFERENT, EQUIVALENT, NOT_DECIDED
-from signatures.errors import UsageError
+from export_model.exporter.play.match import decide
+from export_model.exporter.play.options import PlayOptions
+from export_model.exporter.play.student import t_quantile, upper_tail
+from export_model.exporter.verify.plays import DIFFERENT, EQUIVALENT, NOT_DECIDED
+from export_model.signatures.errors import UsageError
 
 EPISODES = 200
 #: From the tables of R 4 (qt), which are not ours: (upper tail, degrees of freedom, quantile).

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from exporter.play.gymnasium_world import GymnasiumWorld, own_maker
-from exporter.play.options import PlayOptions
-from exporter.verify.options import VerifyOptions
-from exporter.verify.plays import EQUIVALENT
+from export_model.exporter.play.gymnasium_world import GymnasiumWorld, own_maker
+from export_model.exporter.play.options import PlayOptions
+from export_model.exporter.verify.options import VerifyOptions
+from export_model.exporter.verify.plays import EQUIVALENT
+from export_model.signatures.errors import UsageError
 from fixtures import gym
 from fixtures import path as fixture
-from signatures.errors import UsageError
 from tests.commands import export_model, is_refused
 from tests.play.conftest import FEW, Play
 
@@ -185,7 +185,7 @@ class Told:
 
 
 def signature_of(name: str) -> Any:
-    from exporter import inspect_model
+    from export_model.exporter import inspect_model
 
     return inspect_model(fixture(name)).policies[0].policy.signature
 
@@ -253,7 +253,7 @@ def test_a_number_is_a_vector_with_a_1_and_a_box_is_clipped() -> None:
 
 
 def test_choices_begin_where_the_space_says() -> None:
-    from exporter import inspect_model
+    from export_model.exporter import inspect_model
 
     signature = inspect_model(gym.path("CartPole-v1")).policies[0].policy.signature
     told = Told(np.zeros(4), {}, Space(n=2, start=5))

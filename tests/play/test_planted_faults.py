@@ -9,9 +9,9 @@ from typing import Any
 import onnx
 import pytest
 
-from exporter.compare import comparison
-from exporter.play.options import PlayOptions
-from exporter.verify.options import VerifyOptions
+from export_model.exporter.compare import comparison
+from export_model.exporter.play.options import PlayOptions
+from export_model.exporter.verify.options import VerifyOptions
 from tests.play.conftest import FEW, Play
 from tests.play.faults import IN_FILES, IN_PROGRAMS, Answer, Array, Fault, ProgramFault
 

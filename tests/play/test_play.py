@@ -14,17 +14,17 @@ import onnx
 import pytest
 
 import export_model as public
-from exporter.play.environments import ENVIRONMENTS
-from exporter.play.episodes import SIDE_BY_SIDE, play_episodes
-from exporter.play.named import world_maker
-from exporter.play.options import PlayOptions
-from exporter.play.worlds import Outcome, View
-from exporter.verify.options import VerifyOptions
-from exporter.verify.plays import DIFFERENT, EQUIVALENT, NOT_DECIDED
+from export_model.exporter.play.environments import ENVIRONMENTS
+from export_model.exporter.play.episodes import SIDE_BY_SIDE, play_episodes
+from export_model.exporter.play.named import world_maker
+from export_model.exporter.play.options import PlayOptions
+from export_model.exporter.play.worlds import Outcome, View
+from export_model.exporter.verify.options import VerifyOptions
+from export_model.exporter.verify.plays import DIFFERENT, EQUIVALENT, NOT_DECIDED
+from export_model.signatures.errors import UsageError
+from export_model.signatures.spec import PolicySignature
 from fixtures import path as fixture
 from fixtures import trained
-from signatures.errors import UsageError
-from signatures.spec import PolicySignature
 from tests.commands import export_model, is_refused
 from tests.play.conftest import FEW, Play
 from tests.play.faults import order, through
@@ -193,7 +193,9 @@ def test_others_are_played_where_the_first_episodes_do_not_decide(bundles: Path,
 
 def test_not_decided_is_a_failure_only_with_strict(bundles: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     make = world_maker("Hallway", bundles / "Hallway")
-    monkeypatch.setattr("exporter.play.play.world_maker", lambda *_: lambda signature: noisy(make(signature), 0.1))
+    monkeypatch.setattr(
+        "export_model.exporter.play.play.world_maker", lambda *_: lambda signature: noisy(make(signature), 0.1)
+    )
     command = ("play", bundles / "Hallway", "--env", "Hallway", "--runtimes", "onnxruntime")
     assert export_model(*command).status == 0
     assert export_model(*command, "--strict").status == 1
@@ -231,7 +233,7 @@ def test_a_source_that_cannot_play_is_refused_before_it_is_exported(
     def write(*given: object) -> None:
         raise AssertionError("an artefact was written")
 
-    monkeypatch.setattr("exporter.export.pipeline.artefacts_of", write)
+    monkeypatch.setattr("export_model.exporter.export.pipeline.artefacts_of", write)
     path = trained.run_folder(source) if source == "GridWorld" else fixture(source)
     ran = export_model("play", path, "--env", "3DBall")
     assert ran.status == 2 and says in ran.err and not ran.out
@@ -267,7 +269,7 @@ class Broken:
 def test_a_world_that_is_broken_is_refused(
     reward: float, says: str, play: Play, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("exporter.play.episodes.MOST_STEPS", 5)
+    monkeypatch.setattr("export_model.exporter.play.episodes.MOST_STEPS", 5)
 
     def make(signature: PolicySignature) -> Broken:
         return Broken(reward)
@@ -291,6 +293,6 @@ def test_numpy_takes_one_thread_in_a_command(said: str | None, threads: str, tmp
     (tmp_path / "says.py").write_text("import os\nraise SystemExit(os.environ.get('OPENBLAS_NUM_THREADS'))\n")
     own = {k: v for k, v in os.environ.items() if k != "OPENBLAS_NUM_THREADS"}
     own |= {} if said is None else {"OPENBLAS_NUM_THREADS": said}
-    command = (sys.executable, "-m", "exporter", "play", fixture("continuous"), "--env", "says:make")
+    command = (sys.executable, "-m", "export_model", "play", fixture("continuous"), "--env", "says:make")
     ran = subprocess.run(command, cwd=tmp_path, env=own, capture_output=True, text=True, check=False)
     assert threads in ran.stderr.splitlines(), ran.stderr

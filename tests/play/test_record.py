@@ -12,10 +12,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from exporter.verify.plays import read_plays
+from export_model.exporter.verify.plays import read_plays
+from export_model.signatures.contract import PARITY
+from export_model.signatures.errors import BundleError
 from fixtures import trained
-from signatures.contract import PARITY
-from signatures.errors import BundleError
 from tests.commands import export_model, is_refused
 from tests.play.conftest import FEW
 from tests.reports.validation import check_parity

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from converters.formats.format import WriteOptions
-from converters.formats.programs.members import Field, Header
-from converters.formats.programs.plan import formula, plan_of
-from converters.formats.programs.weights import weights_name
-from converters.policy.policy import Policy
-from signatures.code import CodeOptions
+from export_model.converters.formats.format import WriteOptions
+from export_model.converters.formats.programs.members import Field, Header
+from export_model.converters.formats.programs.plan import formula, plan_of
+from export_model.converters.formats.programs.weights import weights_name
+from export_model.converters.policy.policy import Policy
+from export_model.signatures.code import CodeOptions
 
 #: Each has another observation, in every language by the same formula.
 STEPS = 6

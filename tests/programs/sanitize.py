@@ -13,9 +13,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from converters.runtimes.c import compiler
-from exporter.export.pipeline import ExportOptions, export
-from signatures.errors import ExportModelError
+from export_model.converters.runtimes.c import compiler
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.signatures.errors import ExportModelError
 from tests import known
 from tests.programs.mains import c_main, called
 

@@ -14,12 +14,12 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from converters.formats.registry import WRITTEN
-from converters.runtimes.pool import RuntimePool
-from exporter.export.pipeline import ExportOptions, export
-from exporter.reports.summary import failure_lines
-from exporter.verify.options import VerifyOptions
-from signatures.errors import ExportModelError
+from export_model.converters.formats.registry import WRITTEN
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.reports.summary import failure_lines
+from export_model.exporter.verify.options import VerifyOptions
+from export_model.signatures.errors import ExportModelError
 from tests import known
 
 KEYS = tuple(f.key for f in WRITTEN.values() if f.program)

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.graph.blocks import LANES, TERMS
-from converters.graph.nodes import Graph, Node, TensorShape
-from converters.graph.types import FLOAT32
-from converters.runtimes.pool import RuntimePool
-from signatures.code import CodeOptions
+from export_model.converters.graph.blocks import LANES, TERMS
+from export_model.converters.graph.nodes import Graph, Node, TensorShape
+from export_model.converters.graph.types import FLOAT32
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.signatures.code import CodeOptions
 from tests.graph.harness import Array, Runtimes, policy_of
 
 pytestmark = [pytest.mark.xdist_group("programs")]

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from converters.runtimes.javascript.node import node_executable
-from exporter.export.pipeline import ExportOptions, export
+from export_model.converters.runtimes.javascript.node import node_executable
+from export_model.exporter.export.pipeline import ExportOptions, export
 from fixtures import FIXTURES, path
 from tests.docs.workshop import MODULES
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.graph.program import MAX_TERMS
-from exporter.export.pipeline import ExportOptions, export
+from export_model.converters.graph.program import MAX_TERMS
+from export_model.exporter.export.pipeline import ExportOptions, export
 from tests.handmade import constant, dense, graph_bytes, node, placeholder
 
 LENGTH = 3000

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from converters.formats.format import WriteOptions
-from converters.formats.programs.members import header_of
-from converters.formats.registry import WRITTEN
-from converters.policy.policy import Policy
-from exporter.export.sources import read_source
+from export_model.converters.formats.format import WriteOptions
+from export_model.converters.formats.programs.members import header_of
+from export_model.converters.formats.registry import WRITTEN
+from export_model.converters.policy.policy import Policy
+from export_model.exporter.export.sources import read_source
 from fixtures import FIXTURES, path
 from tests.programs.machines import MACHINES, Machine, flash_and_ram
 

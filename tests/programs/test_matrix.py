@@ -8,14 +8,14 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from converters.compiler.passes.weights import Storage, round_weights
-from converters.formats.format import Format, WriteOptions
-from converters.policy.policy import Policy
-from exporter.export.pipeline import ExportOptions, export
-from exporter.export.sources import read_source
-from exporter.reports.summary import failure_lines
+from export_model.converters.compiler.passes.weights import Storage, round_weights
+from export_model.converters.formats.format import Format, WriteOptions
+from export_model.converters.policy.policy import Policy
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.export.sources import read_source
+from export_model.exporter.reports.summary import failure_lines
+from export_model.signatures.code import CodeOptions
 from fixtures import FOLDER, path
-from signatures.code import CodeOptions
 from tests.programs.mains import MAINS, called
 from tests.programs.test_options import build, said
 from tests.programs.test_programs import PROGRAMS, need

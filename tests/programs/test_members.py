@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from converters.formats.format import Format, WriteOptions
-from converters.formats.registry import WRITTEN
-from converters.graph.run import run_graph
-from converters.policy.policy import Policy
-from exporter.export.sources import read_source
+from export_model.converters.formats.format import Format, WriteOptions
+from export_model.converters.formats.registry import WRITTEN
+from export_model.converters.graph.run import run_graph
+from export_model.converters.policy.policy import Policy
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.roles import Role
 from fixtures import FOLDER, path
-from signatures.roles import Role
 from tests.programs.mains import Called, called
 from tests.programs.test_options import build, said
 from tests.programs.test_programs import PROGRAMS

@@ -12,19 +12,19 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from converters.formats.format import Format, WriteOptions
-from converters.formats.programs.members import header_of
-from converters.formats.registry import WRITTEN
-from converters.graph.nodes import Graph, Node, TensorShape
-from converters.graph.run import run_graph
-from converters.graph.types import FLOAT32
-from converters.policy.policy import Policy
-from converters.runtimes.pool import RuntimePool
-from exporter.export.pipeline import ExportOptions, export
-from exporter.export.sources import read_source
+from export_model.converters.formats.format import Format, WriteOptions
+from export_model.converters.formats.programs.members import header_of
+from export_model.converters.formats.registry import WRITTEN
+from export_model.converters.graph.nodes import Graph, Node, TensorShape
+from export_model.converters.graph.run import run_graph
+from export_model.converters.graph.types import FLOAT32
+from export_model.converters.policy.policy import Policy
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.code import CodeOptions
+from export_model.signatures.errors import UnsupportedOpError
 from fixtures import FIXTURES, path
-from signatures.code import CodeOptions
-from signatures.errors import UnsupportedOpError
 from tests.comparing import compare_artefacts
 from tests.graph.harness import Runtimes, policy_of
 from tests.programs.mains import MAINS, called

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.formats.registry import WRITTEN
-from converters.graph.nodes import TensorShape
-from converters.graph.ops.table import TABLE
-from converters.graph.types import FLOAT32
-from converters.runtimes.pool import RuntimePool
-from signatures.code import CodeOptions
-from signatures.errors import UnsupportedOpError
+from export_model.converters.formats.registry import WRITTEN
+from export_model.converters.graph.nodes import TensorShape
+from export_model.converters.graph.ops.table import TABLE
+from export_model.converters.graph.types import FLOAT32
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.signatures.code import CodeOptions
+from export_model.signatures.errors import UnsupportedOpError
 from tests.graph.harness import Array, Runtimes, policy_of
 from tests.graph.samples import Sample
 from tests.graph.test_ops import BY_OP, computed

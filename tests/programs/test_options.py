@@ -10,24 +10,24 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from converters.compiler.passes.weights import Storage
-from converters.formats.format import Format, WriteOptions
-from converters.formats.programs.artifact import can_confine, vetted
-from converters.formats.programs.members import answers
-from converters.formats.programs.weights import weights_name
-from converters.formats.registry import WRITTEN
-from converters.policy.policy import Policy
-from converters.runtimes.c import compiler
-from converters.runtimes.csharp import tools
-from converters.runtimes.javascript.node import node_executable
-from converters.runtimes.pool import RuntimePool
-from exporter.api import verify_bundle
-from exporter.export.pipeline import Exporter, ExportOptions, export
-from exporter.export.sources import read_source
-from exporter.reports.summary import failure_lines
+from export_model.converters.compiler.passes.weights import Storage
+from export_model.converters.formats.format import Format, WriteOptions
+from export_model.converters.formats.programs.artifact import can_confine, vetted
+from export_model.converters.formats.programs.members import answers
+from export_model.converters.formats.programs.weights import weights_name
+from export_model.converters.formats.registry import WRITTEN
+from export_model.converters.policy.policy import Policy
+from export_model.converters.runtimes.c import compiler
+from export_model.converters.runtimes.csharp import tools
+from export_model.converters.runtimes.javascript.node import node_executable
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.api import verify_bundle
+from export_model.exporter.export.pipeline import Exporter, ExportOptions, export
+from export_model.exporter.export.sources import read_source
+from export_model.exporter.reports.summary import failure_lines
+from export_model.signatures.code import CodeOptions, code_options
+from export_model.signatures.errors import DamagedFileError, UsageError
 from fixtures import path
-from signatures.code import CodeOptions, code_options
-from signatures.errors import DamagedFileError, UsageError
 from tests.programs.mains import MAINS
 from tests.programs.test_programs import PROGRAMS, need
 

@@ -9,18 +9,18 @@ from pathlib import Path
 
 import pytest
 
-from converters.formats.format import WriteOptions
-from converters.formats.registry import WRITTEN
-from converters.graph.ops.loops.own_math import OWN
-from converters.policy.policy import Policy
-from converters.runtimes.c import compiler
-from converters.runtimes.csharp import tools
-from converters.runtimes.javascript.node import node_executable
-from exporter.export.pipeline import Exporter, ExportOptions, export
-from exporter.export.sources import read_source
+from export_model.converters.formats.format import WriteOptions
+from export_model.converters.formats.registry import WRITTEN
+from export_model.converters.graph.ops.loops.own_math import OWN
+from export_model.converters.policy.policy import Policy
+from export_model.converters.runtimes.c import compiler
+from export_model.converters.runtimes.csharp import tools
+from export_model.converters.runtimes.javascript.node import node_executable
+from export_model.exporter.export.pipeline import Exporter, ExportOptions, export
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.code import CodeOptions, code_options
+from export_model.signatures.errors import UsageError
 from fixtures import FIXTURES, path
-from signatures.code import CodeOptions, code_options
-from signatures.errors import UsageError
 from tests.bench.own_math import measure
 from tests.programs.machines import MACHINES
 from tests.programs.mains import MAINS, called

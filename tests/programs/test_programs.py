@@ -8,26 +8,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.files.children.process import RunFailedError
-from converters.formats.format import Format, WriteOptions
-from converters.formats.programs import plan
-from converters.formats.programs.members import answers
-from converters.formats.registry import WRITTEN
-from converters.graph.nodes import Graph, Node, TensorShape
-from converters.graph.program import program_of
-from converters.graph.types import INT32
-from converters.runtimes.c import compiler
-from converters.runtimes.csharp import tools
-from converters.runtimes.javascript.node import node_executable
-from converters.runtimes.pool import RuntimePool
-from converters.runtimes.registry import available_runtimes
-from exporter.export.pipeline import ExportOptions, export
-from exporter.export.sources import read_source
-from exporter.inspect.inspection import inspect_source
-from exporter.reports.summary import failure_lines
+from export_model.converters.files.children.process import RunFailedError
+from export_model.converters.formats.format import Format, WriteOptions
+from export_model.converters.formats.programs import plan
+from export_model.converters.formats.programs.members import answers
+from export_model.converters.formats.registry import WRITTEN
+from export_model.converters.graph.nodes import Graph, Node, TensorShape
+from export_model.converters.graph.program import program_of
+from export_model.converters.graph.types import INT32
+from export_model.converters.runtimes.c import compiler
+from export_model.converters.runtimes.csharp import tools
+from export_model.converters.runtimes.javascript.node import node_executable
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.converters.runtimes.registry import available_runtimes
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.export.sources import read_source
+from export_model.exporter.inspect.inspection import inspect_source
+from export_model.exporter.reports.summary import failure_lines
+from export_model.signatures.code import CodeOptions
+from export_model.signatures.errors import UnsupportedOpError
 from fixtures import FIXTURES, path
-from signatures.code import CodeOptions
-from signatures.errors import UnsupportedOpError
 from tests import known
 from tests.conftest import Chosen
 from tests.graph.harness import Runtimes, policy_of

@@ -6,15 +6,15 @@ from pathlib import Path
 
 import pytest
 
-from converters.files.children.confinement import in_force
-from converters.files.children.process import RunFailedError
-from converters.formats.format import Format
-from converters.formats.programs import artifact
-from converters.runtimes.pool import RuntimePool
-from exporter.api import verify_bundle
-from exporter.export.pipeline import ExportOptions, export
+from export_model.converters.files.children.confinement import in_force
+from export_model.converters.files.children.process import RunFailedError
+from export_model.converters.formats.format import Format
+from export_model.converters.formats.programs import artifact
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.api import verify_bundle
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.signatures.errors import UnsupportedOpError
 from fixtures import path
-from signatures.errors import UnsupportedOpError
 from tests.programs.test_programs import PROGRAMS, need
 
 pytestmark = [

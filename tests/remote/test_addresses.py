@@ -10,18 +10,18 @@ from typing import Any
 
 import pytest
 
-from converters.files import fetch
-from exporter import export_model, inspect_model, verify_bundle
-from exporter.export.pipeline import ExportOptions
-from exporter.fleet.fleet import export_fleet
-from exporter.fleet.sources import sources_in
-from exporter.fleet.worker import Outcome
-from exporter.remote import fetching, sending
-from exporter.remote.fetching import nearby
-from exporter.remote.filesystem import remote
+from export_model.converters.files import fetch
+from export_model.exporter import export_model, inspect_model, verify_bundle
+from export_model.exporter.export.pipeline import ExportOptions
+from export_model.exporter.fleet.fleet import export_fleet
+from export_model.exporter.fleet.sources import sources_in
+from export_model.exporter.fleet.worker import Outcome
+from export_model.exporter.remote import fetching, sending
+from export_model.exporter.remote.fetching import nearby
+from export_model.exporter.remote.filesystem import remote
+from export_model.signatures.contract import POLICY
+from export_model.signatures.errors import BundleError, SourceError, UsageError
 from fixtures import path as fixture
-from signatures.contract import POLICY
-from signatures.errors import BundleError, SourceError, UsageError
 from tests.comparing import compare_artefacts
 
 fsspec = pytest.importorskip("fsspec")

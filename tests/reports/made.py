@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from msgspec.structs import replace
 
-from exporter.reports.entry import Entry
-from exporter.verify import findings
-from exporter.verify.difference import BINS
-from exporter.verify.findings import Bisection, Finding, Numbers
-from exporter.verify.report import ParityReport
-from exporter.verify.tolerances import Tolerance
+from export_model.exporter.reports.entry import Entry
+from export_model.exporter.verify import findings
+from export_model.exporter.verify.difference import BINS
+from export_model.exporter.verify.findings import Bisection, Finding, Numbers
+from export_model.exporter.verify.report import ParityReport
+from export_model.exporter.verify.tolerances import Tolerance
 
 SPREAD = (5, 0, 0, 2, 9, *([0] * (BINS - 5)))
 RAN = {"version": "1.0", "status": "ran", "reason": None}

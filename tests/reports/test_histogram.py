@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from exporter.verify.difference import BINS, add_histograms, by_decade, compare, decades
-from exporter.verify.tolerances import Tolerance
+from export_model.exporter.verify.difference import BINS, add_histograms, by_decade, compare, decades
+from export_model.exporter.verify.tolerances import Tolerance
 
 
 def test_decades_by_hand() -> None:

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from exporter.reports.junit import junit_xml
-from exporter.verify.report import ParityReport
+from export_model.exporter.reports.junit import junit_xml
+from export_model.exporter.verify.report import ParityReport
 from tests.reports.made import FAILING, PASSING, UNVERIFIED, entry
 
 #: element → (attributes it must have, others it may have, elements inside): what Jenkins's junit-10 schema allows

@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from converters.compiler.options import CompileOptions
-from converters.graph.nodes import Graph, Node
-from converters.graph.ops.samplers import SAMPLERS
-from exporter.export.sources import read_source
-from exporter.reports.layers import Block, blocks_of
-from exporter.reports.layout import layout
+from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.graph.nodes import Graph, Node
+from export_model.converters.graph.ops.samplers import SAMPLERS
+from export_model.exporter.export.sources import read_source
+from export_model.exporter.reports.layers import Block, blocks_of
+from export_model.exporter.reports.layout import layout
 from fixtures import FIXTURES
 from fixtures import path as fixture
 

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from exporter.reports.markdown import markdown_text
-from exporter.reports.write import Destinations, parity_documents
+from export_model.exporter.reports.markdown import markdown_text
+from export_model.exporter.reports.write import Destinations, parity_documents
 from tests.reports.made import FAILING, PASSING, UNVERIFIED, comparison, entry
 
 

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from exporter.cli.app import app
-from exporter.cli.console import Console, Progress
-from exporter.cli.options import JUDGING, as_given
-from exporter.cli.verify import verify_command
+from export_model.exporter.cli.app import app
+from export_model.exporter.cli.console import Console, Progress
+from export_model.exporter.cli.options import JUDGING, as_given
+from export_model.exporter.cli.verify import verify_command
 from fixtures import path as fixture
 from tests.commands import Ran, export_model, is_refused
 from tests.exporter.rehearsal import ALL, KNOWN, ActingPool, Tensors
@@ -32,7 +32,7 @@ def exporting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Exporting:
 
     def run(*options: object, good: bool = True, command: tuple[object, ...] | None = None) -> Ran:
         pool = ActingPool() if good else ActingPool(spoil)
-        for module in ("exporter.export.again", "converters.runtimes.pool"):
+        for module in ("export_model.exporter.export.again", "export_model.converters.runtimes.pool"):
             monkeypatch.setattr(f"{module}.chosen_runtimes", lambda wanted, formats: (ALL, list(KNOWN)))
             monkeypatch.setattr(f"{module}.RuntimePool", lambda: pool)
         return export_model(*(command or (fixture("continuous"), "-o", tmp_path / "out")), *options)
@@ -93,7 +93,7 @@ def test_no_report_of_an_earlier_run_is_left(
     def stop(*given: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("exporter.cli.export._export_few", stop)
+    monkeypatch.setattr("export_model.exporter.cli.export._export_few", stop)
     report.write_text("of yesterday: all is well")
     summary = tmp_path / "summary.md"
     summary.write_text("of the step before\n")

@@ -13,11 +13,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from exporter.reports import charts
-from exporter.reports.entry import Entry, of_bundle, of_result
-from exporter.reports.page import page
-from exporter.reports.sections import first_values
-from exporter.verify.options import VerifyOptions
+from export_model.exporter.reports import charts
+from export_model.exporter.reports.entry import Entry, of_bundle, of_result
+from export_model.exporter.reports.page import page
+from export_model.exporter.reports.sections import first_values
+from export_model.exporter.verify.options import VerifyOptions
 from fixtures import path as fixture
 from tests.exporter.rehearsal import ActingPool, export
 from tests.reports.made import FAILING, PASSING, UNVERIFIED, entry

@@ -10,13 +10,13 @@ import msgspec
 import pytest
 from msgspec.structs import replace
 
-from converters.formats.bundle.bundle import dumps
-from exporter.verify import findings
-from exporter.verify.excuses import NOT_FROM_ZERO, ROUNDING, Forgiven
-from exporter.verify.findings import Bisection, Finding
-from exporter.verify.plays import VERDICTS, Interval, Player, PlayRecord
-from exporter.verify.report import ParityReport
-from exporter.verify.tolerances import Tolerance
+from export_model.converters.formats.bundle.bundle import dumps
+from export_model.exporter.verify import findings
+from export_model.exporter.verify.excuses import NOT_FROM_ZERO, ROUNDING, Forgiven
+from export_model.exporter.verify.findings import Bisection, Finding
+from export_model.exporter.verify.plays import VERDICTS, Interval, Player, PlayRecord
+from export_model.exporter.verify.report import ParityReport
+from export_model.exporter.verify.tolerances import Tolerance
 from tests.reports.made import BEGINNING, FAILING, PASSING, UNVERIFIED, comparison
 from tests.reports.validation import check_parity, schema
 

@@ -10,13 +10,13 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from exporter.cli.console import _colour
-from exporter.export import job
-from exporter.export.pipeline import ExportOptions, export
-from exporter.reports.summary import failure_lines
-from exporter.verify.findings import Accepted
-from exporter.verify.report import ParityReport
-from exporter.verify.verdict import verdict
+from export_model.exporter.cli.console import _colour
+from export_model.exporter.export import job
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.reports.summary import failure_lines
+from export_model.exporter.verify.findings import Accepted
+from export_model.exporter.verify.report import ParityReport
+from export_model.exporter.verify.verdict import verdict
 from fixtures import FOLDER
 from fixtures import path as fixture
 from tests.commands import export_model, is_refused

@@ -8,11 +8,11 @@ from typing import Any
 import pytest
 from msgspec.json import schema_components
 
-from exporter.reports import policy_schema
-from exporter.reports.policy_schema import FILE, schema_text
-from signatures import contract
-from signatures.interface import Interface
-from signatures.spec import PolicySignature
+from export_model.exporter.reports import policy_schema
+from export_model.exporter.reports.policy_schema import FILE, schema_text
+from export_model.signatures import contract
+from export_model.signatures.interface import Interface
+from export_model.signatures.spec import PolicySignature
 from tests.reports.validation import schema
 
 

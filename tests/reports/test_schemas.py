@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from jsonschema import Draft202012Validator
 
-from converters.formats.bundle.bundle import dumps
+from export_model.converters.formats.bundle.bundle import dumps
 from fixtures import FIXTURES
 from fixtures import path as fixture
 from tests.commands import ROOT, export_model

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from exporter.verify.options import VerifyOptions
-from exporter.verify.tolerance_file import read_tolerances
-from exporter.verify.tolerances import Tolerance, ToleranceRule, tolerance_by_rules
+from export_model.exporter.verify.options import VerifyOptions
+from export_model.exporter.verify.tolerance_file import read_tolerances
+from export_model.exporter.verify.tolerances import Tolerance, ToleranceRule, tolerance_by_rules
+from export_model.signatures.errors import UsageError
 from fixtures import path as fixture
-from signatures.errors import UsageError
 from tests.commands import export_model, is_refused
 from tests.exporter.rehearsal import ActingPool, Tensors, export
 

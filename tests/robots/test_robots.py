@@ -21,14 +21,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import export_model as public
-from converters.consumers.profiles import PROFILES, profile
-from converters.consumers.robots.interface import Interface, Tensor, interface_of
-from converters.consumers.robots.loaders import LOADERS
-from exporter import export_model, load_policy, verify_bundle
-from exporter.verify.checks.consumer import consumers
+from export_model.converters.consumers.profiles import PROFILES, profile
+from export_model.converters.consumers.robots.interface import Interface, Tensor, interface_of
+from export_model.converters.consumers.robots.loaders import LOADERS
+from export_model.exporter import export_model, load_policy, verify_bundle
+from export_model.exporter.verify.checks.consumer import consumers
+from export_model.signatures.contract import parse_signature
+from export_model.signatures.errors import ProfileError, UsageError
 from fixtures import path as fixture
-from signatures.contract import parse_signature
-from signatures.errors import ProfileError, UsageError
 from tests.commands import export_model as command
 from tests.commands import is_refused
 from tests.known import ABSENT, SHARED

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.files import tensorflow_messages as schema
-from converters.formats.frozen_graph.reader import read_graph
-from signatures.errors import DamagedFileError
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.formats.frozen_graph.reader import read_graph
+from export_model.signatures.errors import DamagedFileError
 from tests.commands import export_model
 from tests.handmade import (
     NodeDef,

@@ -19,17 +19,17 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from converters.compiler.options import CompileOptions
-from converters.files import tensorflow_messages as schema
-from converters.formats.bundle.bundle import Bundle
-from converters.formats.recognise import REFUSED, UNKNOWN, recognise
-from converters.formats.registry import FORMATS
-from exporter.export.pipeline import ExportOptions, export
-from exporter.inspect.inspection import inspect_source
+from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.formats.bundle.bundle import Bundle
+from export_model.converters.formats.recognise import REFUSED, UNKNOWN, recognise
+from export_model.converters.formats.registry import FORMATS
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.inspect.inspection import inspect_source
+from export_model.signatures.errors import BundleError, ExportModelError
+from export_model.signatures.roles import Role
 from fixtures import FIXTURES
 from fixtures import path as fixture
-from signatures.errors import BundleError, ExportModelError
-from signatures.roles import Role
 from tests.commands import files_in
 from tests.handmade import continuous_policy, graph_bytes, sampled_policy
 

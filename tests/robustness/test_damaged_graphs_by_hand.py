@@ -9,9 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.formats.frozen_graph.reader import read_graph
-from converters.graph.nodes import TensorShape
-from signatures.errors import DamagedFileError, ExportModelError, GraphError, NotAPolicyError, UnsupportedOpError
+from export_model.converters.formats.frozen_graph.reader import read_graph
+from export_model.converters.graph.nodes import TensorShape
+from export_model.signatures.errors import (
+    DamagedFileError,
+    ExportModelError,
+    GraphError,
+    NotAPolicyError,
+    UnsupportedOpError,
+)
 from tests.commands import export_model
 from tests.handmade import (
     NodeDef,
@@ -267,7 +273,7 @@ def test_a_fault_of_a_pass_names_the_file_too(
     def failing(*_: object) -> None:
         raise fault
 
-    monkeypatch.setattr("exporter.export.sources.compile_graph", failing)
+    monkeypatch.setattr("export_model.exporter.export.sources.compile_graph", failing)
     message = refused(continuous_policy(), tmp_path, *said)
     assert "\n  why: " in message
 
@@ -276,7 +282,7 @@ def test_a_fault_of_a_writer_names_the_file_too(tmp_path: Path, monkeypatch: pyt
     def failing(*_: object) -> None:
         raise TypeError("x")
 
-    monkeypatch.setattr("converters.formats.onnx.writer.write", failing)
+    monkeypatch.setattr("export_model.converters.formats.onnx.writer.write", failing)
     refused(continuous_policy(), tmp_path, "cannot be understood", "TypeError")
 
 

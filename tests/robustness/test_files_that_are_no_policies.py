@@ -14,14 +14,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.files import tensorflow_messages as schema
-from converters.files.fetch import neighbours
-from converters.formats.recognise import recognise
-from converters.graph.nodes import TensorShape
-from exporter import inspect_model
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.files.fetch import neighbours
+from export_model.converters.formats.recognise import recognise
+from export_model.converters.graph.nodes import TensorShape
+from export_model.exporter import inspect_model
+from export_model.signatures.errors import SourceError
 from fixtures import FIXTURES
 from fixtures import path as fixture
-from signatures.errors import SourceError
 from tests.commands import export_model, files_in, is_refused
 from tests.handmade import continuous_policy, graph_bytes, node
 

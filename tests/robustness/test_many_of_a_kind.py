@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.compiler import compile
-from converters.files import tensorflow_messages as schema
-from converters.formats.barracuda import format as nn
-from converters.formats.frozen_graph.reader import read_graph
-from converters.formats.saved_model import signature
-from converters.graph.ops.barracuda import builder
-from exporter.export.sources import read_source
-from signatures.errors import MAX_LINE, DamagedFileError, GraphError, NotAPolicyError, UnsupportedOpError
+from export_model.converters.compiler import compile
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.formats.barracuda import format as nn
+from export_model.converters.formats.frozen_graph.reader import read_graph
+from export_model.converters.formats.saved_model import signature
+from export_model.converters.graph.ops.barracuda import builder
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.errors import MAX_LINE, DamagedFileError, GraphError, NotAPolicyError, UnsupportedOpError
 from tests.barracuda.nn_files import write_nn
 from tests.barracuda.nn_running import nn_model
 from tests.handmade import constant, continuous_policy, graph_bytes, graph_def, node

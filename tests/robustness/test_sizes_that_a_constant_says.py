@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.compiler.compile import compile_graph
-from converters.compiler.options import CompileOptions
-from converters.formats.frozen_graph.reader import read_graph
-from converters.graph.run import run_graph
-from signatures.errors import ExportModelError, GraphError
+from export_model.converters.compiler.compile import compile_graph
+from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.formats.frozen_graph.reader import read_graph
+from export_model.converters.graph.run import run_graph
+from export_model.signatures.errors import ExportModelError, GraphError
 from tests.commands import export_model, files_in, is_refused
 from tests.handmade import NodeDef, constant, graph_bytes, node, placeholder
 

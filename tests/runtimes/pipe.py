@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from converters.runtimes.javascript.node import INSTALL_TFJS, JS_SOURCE, js_home, node_executable
+from export_model.converters.runtimes.javascript.node import INSTALL_TFJS, JS_SOURCE, js_home, node_executable
 
 Array = npt.NDArray[Any]
 

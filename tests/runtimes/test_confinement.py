@@ -11,17 +11,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.files.children import memory_limits as memory
-from converters.files.children.confinement import in_force
-from converters.files.children.environment import child_environment, readable_places
-from converters.files.children.memory_limits import FREE
-from converters.files.children.process import RunFailedError, RuntimeProcess
-from converters.files.children.python import child_command, confined_command
-from converters.formats.registry import WRITTEN
-from converters.runtimes.javascript.node import _program
-from converters.runtimes.pool import RuntimePool
-from exporter.export.pipeline import ExportOptions, export
-from signatures.errors import RuntimeUnavailableError
+from export_model.converters.files.children import memory_limits as memory
+from export_model.converters.files.children.confinement import in_force
+from export_model.converters.files.children.environment import child_environment, readable_places
+from export_model.converters.files.children.memory_limits import FREE
+from export_model.converters.files.children.process import RunFailedError, RuntimeProcess
+from export_model.converters.files.children.python import child_command, confined_command
+from export_model.converters.formats.registry import WRITTEN
+from export_model.converters.runtimes.javascript.node import _program
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.signatures.errors import RuntimeUnavailableError
 from tests.bench.big_policies import OBSERVED, frozen
 
 pytestmark = pytest.mark.skipif(not all(in_force().values()), reason="this kernel lacks Landlock or seccomp")
@@ -88,7 +88,7 @@ OF_COMPILERS = {"start a process", "start a program", "signal its parent"}
 STARTING = """
 import sys
 from pathlib import Path
-from converters.files.children import bounded, confinement
+from export_model.converters.files.children import bounded, confinement
 confinement.confine({scratch!r}, starts=True)
 done = bounded.run_bounded([sys.executable, "-c", {code!r}], Path({scratch!r}), 1 << 30, 20)
 sys.stderr.write(done.stderr)
@@ -147,7 +147,7 @@ def test_it_can(code: str, way: str, tmp_path: Path) -> None:
 
 def test_a_part_that_is_refused_ends_the_process(tmp_path: Path) -> None:
     """The kernel takes 16 rulesets of Landlock from a process: one more is not left out in silence."""
-    code = "from converters.files.children import confinement as c\nfor _ in range(17): c._landlock(None, ['/'])"
+    code = "from export_model.converters.files.children import confinement as c\nfor _ in range(17): c._landlock(None, ['/'])"
     done = tried(code, tmp_path)
     assert done.returncode != 0 and b"this process cannot be confined" in done.stderr
 
@@ -179,7 +179,7 @@ def test_a_shim_of_node_is_looked_through(tmp_path: Path) -> None:
 
 HUNGRY = """
 import numpy as np, sys
-from converters.files.children.child import claim_stdout, serve
+from export_model.converters.files.children.child import claim_stdout, serve
 class Model:
     def run(self, feeds, fetch, request):
         size = int(feeds["x"][0])
@@ -202,7 +202,7 @@ def test_memory_is_bounded_by_what_it_is_given(tmp_path: Path) -> None:
 
 CYCLIC = """
 import numpy as np, weakref
-from converters.files.children.child import claim_stdout, serve
+from export_model.converters.files.children.child import claim_stdout, serve
 loaded = weakref.WeakSet()
 class Model:
     def __init__(self):
@@ -249,7 +249,7 @@ def test_tensorflow_has_what_a_large_saved_model_takes(
 
 
 def test_its_folder_is_gone_when_it_is() -> None:
-    code = "from converters.files.children.child import *; import os; out = claim_stdout(); "
+    code = "from export_model.converters.files.children.child import *; import os; out = claim_stdout(); "
     code += "serve('a', os.environ['TMPDIR'], None, (), out)"
     with RuntimeProcess(
         "a", [sys.executable, "-c", f"import sys; sys.path.insert(0, {str(Path.cwd())!r}); {code}"]

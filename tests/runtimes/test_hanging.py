@@ -8,16 +8,16 @@ from pathlib import Path
 
 import pytest
 
-from converters.files.children import process
-from converters.files.children import time_limits as patience
-from converters.files.children.process import RunFailedError, RuntimeProcess
-from converters.formats.keras import children
-from converters.runtimes.pool import RuntimePool
-from signatures.errors import DamagedFileError
+from export_model.converters.files.children import process
+from export_model.converters.files.children import time_limits as patience
+from export_model.converters.files.children.process import RunFailedError, RuntimeProcess
+from export_model.converters.formats.keras import children
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.signatures.errors import DamagedFileError
 
 _PROGRAM = """
 import sys, time
-from converters.files.children.frames import read_frame, write_frame
+from export_model.converters.files.children.frames import read_frame, write_frame
 out = sys.stdout.buffer
 while True:
     header, _ = read_frame(sys.stdin.buffer)

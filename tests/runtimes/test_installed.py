@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from converters.files.children.process import RuntimeProcess
-from converters.runtimes.installed import STAMP, check
-from converters.runtimes.javascript.node import JS_SOURCE, js_home
-from converters.runtimes.registry import RUNTIMES
-from converters.runtimes.tensorflow1.release import LIBRARIES, RELEASES
-from signatures.digest import sha256_hex
-from signatures.errors import RuntimeUnavailableError
+from export_model.converters.files.children.process import RuntimeProcess
+from export_model.converters.runtimes.installed import STAMP, check
+from export_model.converters.runtimes.javascript.node import JS_SOURCE, js_home
+from export_model.converters.runtimes.registry import RUNTIMES
+from export_model.converters.runtimes.tensorflow1.release import LIBRARIES, RELEASES
+from export_model.signatures.digest import sha256_hex
+from export_model.signatures.errors import RuntimeUnavailableError
 from tests.runtimes.pipe import NEEDS_NODE
 from tests.runtimes.write_installed import installed
 
@@ -32,7 +32,7 @@ def folder(tmp_path: Path) -> Path:
 def test_a_file_is_read_when_it_is_new_or_was_changed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     read: list[bytes] = []
     seen = lambda data: (read.append(data), sha256_hex(data))[1]  # noqa: E731
-    monkeypatch.setattr("converters.runtimes.installed.sha256_hex", seen)
+    monkeypatch.setattr("export_model.converters.runtimes.installed.sha256_hex", seen)
     check(folder, KNOWN, "install it")
     assert read == [b"right", b"too"]
     check(folder, KNOWN, "install it")
@@ -89,7 +89,7 @@ def test_a_file_that_was_put_beside_them_is_not_run(tmp_path: Path) -> None:
 def test_a_library_of_tensorflow_1_that_was_changed_is_not_loaded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("converters.runtimes.tensorflow1.library_folder", lambda release: tmp_path)
+    monkeypatch.setattr("export_model.converters.runtimes.tensorflow1.library_folder", lambda release: tmp_path)
     for name in LIBRARIES:
         (tmp_path / name).write_bytes(b"\x7fELF")
     assert RELEASES[0].libraries.keys() == {*LIBRARIES}

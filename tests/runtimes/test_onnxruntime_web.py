@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from onnx import TensorProto, helper, numpy_helper
 
-from converters.runtimes.javascript.node import JS_SOURCE
+from export_model.converters.runtimes.javascript.node import JS_SOURCE
 from tests.runtimes.pipe import HOME, NEEDS_NODE, Array, Runner, frame
 
 pytestmark = [

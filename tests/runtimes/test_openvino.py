@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from converters.formats.registry import WRITTEN
-from converters.runtimes.pool import RuntimePool, chosen_runtimes
-from converters.runtimes.registry import available_runtimes
-from exporter.export.pipeline import ExportOptions, export
-from exporter.reports.summary import failure_lines
+from export_model.converters.formats.registry import WRITTEN
+from export_model.converters.runtimes.pool import RuntimePool, chosen_runtimes
+from export_model.converters.runtimes.registry import available_runtimes
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.reports.summary import failure_lines
 from fixtures import path
 
 pytestmark = pytest.mark.xdist_group("openvino")

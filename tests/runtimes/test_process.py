@@ -12,7 +12,7 @@ import ml_dtypes
 import numpy as np
 import pytest
 
-from converters.files.children.frames import write_frame
+from export_model.converters.files.children.frames import write_frame
 from tests.runtimes.graph_models import (
     batch,
     info,

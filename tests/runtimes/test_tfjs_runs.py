@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.runtimes.javascript.node import JS_SOURCE
+from export_model.converters.runtimes.javascript.node import JS_SOURCE
 from tests.runtimes.graph_models import (
     B2,
     CHOICE_FEEDS,

@@ -9,8 +9,8 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
-from converters.runtimes.javascript.node import JS_SOURCE, js_home
-from signatures.digest import sha256_hex
+from export_model.converters.runtimes.javascript.node import JS_SOURCE, js_home
+from export_model.signatures.digest import sha256_hex
 
 #: Package → its files that a runtime, a browser's page or the page of ``serve`` loads.
 LOADED = {

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from converters.graph.nodes import node_of
-from converters.graph.run import run_graph
-from converters.policy.policy import Policy
+from export_model.converters.graph.nodes import node_of
+from export_model.converters.graph.run import run_graph
+from export_model.converters.policy.policy import Policy
 
 #: What the keys of the models' signatures are called in a policy.
 CANONICAL = {

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from converters.formats.saved_model.writer import DETERMINISTIC, signatures_of
-from converters.graph.ops.samplers import SAMPLERS
-from converters.policy.policy import Policy
-from signatures.roles import Role
-from signatures.spec import PolicySignature, TensorSpec
+from export_model.converters.formats.saved_model.writer import DETERMINISTIC, signatures_of
+from export_model.converters.graph.ops.samplers import SAMPLERS
+from export_model.converters.policy.policy import Policy
+from export_model.signatures.roles import Role
+from export_model.signatures.spec import PolicySignature, TensorSpec
 from tests.graph.making import graph, node, placeholder
 
 

@@ -12,25 +12,25 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from converters.compiler.passes.weights import Storage
-from converters.files import tensorflow_messages as schema
-from converters.formats.bundle.embed import runnable
-from converters.formats.format import WriteOptions
-from converters.formats.frozen_graph.reader import read_graph
-from converters.formats.registry import WRITTEN
-from converters.formats.saved_model.artifact import graph
-from converters.graph.run import run_graph
-from converters.policy.policy import Policy
-from converters.runtimes.pool import RuntimePool
-from exporter.export.pipeline import ExportOptions, ExportResult, export
-from exporter.export.sources import read_source
-from exporter.reports.summary import failure_lines
+from export_model.converters.compiler.passes.weights import Storage
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.formats.bundle.embed import runnable
+from export_model.converters.formats.format import WriteOptions
+from export_model.converters.formats.frozen_graph.reader import read_graph
+from export_model.converters.formats.registry import WRITTEN
+from export_model.converters.formats.saved_model.artifact import graph
+from export_model.converters.graph.run import run_graph
+from export_model.converters.policy.policy import Policy
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.export.pipeline import ExportOptions, ExportResult, export
+from export_model.exporter.export.sources import read_source
+from export_model.exporter.reports.summary import failure_lines
+from export_model.signatures.contract import EMBEDDED, Contract, Origin, safe_name
+from export_model.signatures.errors import BundleError, DamagedFileError, ExportModelError
+from export_model.signatures.roles import Role
+from export_model.signatures.sampling import draw_cases
 from fixtures import FIXTURES, FOLDER
 from fixtures import path as fixture
-from signatures.contract import EMBEDDED, Contract, Origin, safe_name
-from signatures.errors import BundleError, DamagedFileError, ExportModelError
-from signatures.roles import Role
-from signatures.sampling import draw_cases
 from tests import known
 from tests.corpus.conftest import frozen_corpus, genuine_cases
 
@@ -127,7 +127,7 @@ def test_chains_of_formats_end_where_they_began(name: str, first: str, second: s
 
 
 def test_other_options_still_apply(tmp_path: Path) -> None:
-    from converters.compiler.options import CompileOptions
+    from export_model.converters.compiler.options import CompileOptions
 
     (start,) = exported("continuous", tmp_path / "0")
     options = CompileOptions(deterministic=True)

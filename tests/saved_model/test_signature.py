@@ -7,22 +7,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.compiler.passes.normalise import normalise
-from converters.files import tensorflow_messages as schema
-from converters.formats.frozen_graph.reader import from_graph_def, read_graph
-from converters.formats.saved_model.lengths import without_counted
-from converters.formats.saved_model.reader import read_saved_model
-from converters.formats.saved_model.signature import ModelSignature, Tensor, expose
-from converters.formats.saved_model.signature import expose_signature as with_facts
-from converters.graph.nodes import Graph, Node, TensorShape
-from converters.graph.run import run_graph
-from converters.graph.shapes import infer_types
-from converters.policy.facts import SourceFacts
-from exporter.export.pipeline import ExportOptions, export
-from exporter.export.sources import read_source
+from export_model.converters.compiler.passes.normalise import normalise
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.formats.frozen_graph.reader import from_graph_def, read_graph
+from export_model.converters.formats.saved_model.lengths import without_counted
+from export_model.converters.formats.saved_model.reader import read_saved_model
+from export_model.converters.formats.saved_model.signature import ModelSignature, Tensor, expose
+from export_model.converters.formats.saved_model.signature import expose_signature as with_facts
+from export_model.converters.graph.nodes import Graph, Node, TensorShape
+from export_model.converters.graph.run import run_graph
+from export_model.converters.graph.shapes import infer_types
+from export_model.converters.policy.facts import SourceFacts
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError
+from export_model.signatures.roles import Role
 from fixtures import path as fixture
-from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError
-from signatures.roles import Role
 from tests.handmade import constant, continuous_policy, graph_def
 from tests.handmade import node as tf_node
 

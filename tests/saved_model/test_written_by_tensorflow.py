@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.formats.checkpoint.tensor_bundle import Checkpoint
-from converters.formats.source import ReadOptions
-from converters.policy.facts import DOUBLES_NARROWED
-from converters.runtimes.pool import RuntimePool
-from exporter.export.pipeline import ExportOptions, export
-from exporter.export.sources import read_source
-from exporter.reports.summary import failure_lines
-from signatures.errors import NotAPolicyError, RuntimeUnavailableError, SourceError
+from export_model.converters.formats.checkpoint.tensor_bundle import Checkpoint
+from export_model.converters.formats.source import ReadOptions
+from export_model.converters.policy.facts import DOUBLES_NARROWED
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.export.sources import read_source
+from export_model.exporter.reports.summary import failure_lines
+from export_model.signatures.errors import NotAPolicyError, RuntimeUnavailableError, SourceError
 from tests.saved_model.models import assert_agrees, roles, sources
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("written_by_tensorflow")]

@@ -17,9 +17,15 @@ from typing import Any
 
 import pytest
 
-from converters.runtimes.javascript.browser import INSTALL_CHROMIUM, chromium_executable
-from converters.runtimes.javascript.node import INSTALL_NODE, INSTALL_TFJS, js_home, node_executable, package_version
-from exporter.serve.server import SiteServer, listening
+from export_model.converters.runtimes.javascript.browser import INSTALL_CHROMIUM, chromium_executable
+from export_model.converters.runtimes.javascript.node import (
+    INSTALL_NODE,
+    INSTALL_TFJS,
+    js_home,
+    node_executable,
+    package_version,
+)
+from export_model.exporter.serve.server import SiteServer, listening
 
 SCRIPT = Path(__file__).with_name("visit.mjs")
 #: The button comes with the page, and is free when the check is done.

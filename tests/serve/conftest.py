@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import fixtures
-from converters.runtimes.javascript.node import INSTALL_TFJS, js_home, package_version
+from export_model.converters.runtimes.javascript.node import INSTALL_TFJS, js_home, package_version
 from fixtures.trained import run_folder
 from tests.commands import export_model
 

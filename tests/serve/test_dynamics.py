@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.runtimes.javascript.node import INSTALL_NODE, node_executable
-from exporter.play.environments import ENVIRONMENTS
-from exporter.serve.site import PAGE
+from export_model.converters.runtimes.javascript.node import INSTALL_NODE, node_executable
+from export_model.exporter.play.environments import ENVIRONMENTS
+from export_model.exporter.serve.site import PAGE
 
 AGENTS, STEPS = 5, 400
 #: How many continuous actions.

@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from exporter.serve.gallery import assemble_gallery
-from exporter.serve.scenes import SCENES
-from exporter.serve.site import PAGE, PREVIEWS, assemble, assemble_one_file, describe_page
-from signatures.errors import BundleError
+from export_model.exporter.serve.gallery import assemble_gallery
+from export_model.exporter.serve.scenes import SCENES
+from export_model.exporter.serve.site import PAGE, PREVIEWS, assemble, assemble_one_file, describe_page
+from export_model.signatures.errors import BundleError
 from tests.commands import export_model, files_in, is_refused
 from tests.serve.browsing import CHECKED, served, visit
 from tests.serve.conftest import Bundle

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from exporter.acting.loading import load_policy
-from exporter.serve.site import assemble, assemble_one_file, write_site
+from export_model.exporter.acting.loading import load_policy
+from export_model.exporter.serve.site import assemble, assemble_one_file, write_site
 from fixtures.trained import run_folder
 from tests.commands import export_model
 from tests.serve.browsing import CHECKED, Visit, served, visit, with_backends

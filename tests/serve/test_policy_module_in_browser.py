@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from exporter.acting.loading import load_policy
-from exporter.serve.site import assemble
+from export_model.exporter.acting.loading import load_policy
+from export_model.exporter.serve.site import assemble
 from fixtures import path as fixture
 from tests.acting.test_load_policy import observed
 from tests.serve.browsing import CHECKED, served, visit, with_backends

@@ -10,9 +10,9 @@ from urllib.parse import urlsplit
 import pytest
 from msgspec.structs import replace
 
-from exporter.reports.page import page
-from exporter.serve.onefile import modules_of
-from exporter.serve.site import assemble, assemble_one_file
+from export_model.exporter.reports.page import page
+from export_model.exporter.serve.onefile import modules_of
+from export_model.exporter.serve.site import assemble, assemble_one_file
 from fixtures import path as fixture
 from tests.commands import export_model
 from tests.reports.made import FAILING, PASSING, entry

@@ -14,10 +14,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import exporter.serve.server as server_module
-from exporter.serve.server import CONTENT_POLICY, HEADERS, SiteServer, interrupts, listening
-from exporter.serve.site import PAGE
-from signatures.errors import UsageError
+import export_model.exporter.serve.server as server_module
+from export_model.exporter.serve.server import CONTENT_POLICY, HEADERS, SiteServer, interrupts, listening
+from export_model.exporter.serve.site import PAGE
+from export_model.signatures.errors import UsageError
 from tests.commands import ROOT, export_model, is_refused
 from tests.serve.browsing import served
 from tests.serve.conftest import Bundle
@@ -186,7 +186,7 @@ def test_a_port_that_is_taken_is_refused(bundle: Bundle) -> None:
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_it_cleanly(bundle: Bundle, number: signal.Signals, ignored: bool) -> None:
     """A shell without job control starts jobs in the background with SIGINT ignored, and children inherit that."""
-    command = [sys.executable, "-u", "-m", "exporter", "serve", str(bundle("continuous")), "--port", "0"]
+    command = [sys.executable, "-u", "-m", "export_model", "serve", str(bundle("continuous")), "--port", "0"]
     if ignored:
         command = ["sh", "-c", "trap '' INT TERM; exec \"$@\"", "sh", *command]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:

@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.runtimes.javascript import node as javascript
-from exporter.acting.loading import load_policy
-from exporter.serve import site as site_of_bundles
-from exporter.serve.onefile import one_file
-from exporter.serve.scenes import other_side
-from exporter.serve.server import TYPES
-from exporter.serve.site import PAGE, assemble, assemble_one_file, write_site
+from export_model.converters.runtimes.javascript import node as javascript
+from export_model.exporter.acting.loading import load_policy
+from export_model.exporter.serve import site as site_of_bundles
+from export_model.exporter.serve.onefile import one_file
+from export_model.exporter.serve.scenes import other_side
+from export_model.exporter.serve.server import TYPES
+from export_model.exporter.serve.site import PAGE, assemble, assemble_one_file, write_site
+from export_model.signatures.errors import BundleError, UnsupportedOpError, UsageError
 from fixtures import path as fixture
-from signatures.errors import BundleError, UnsupportedOpError, UsageError
 from tests.commands import export_model, files_in, is_refused
 from tests.serve.conftest import Bundle
 

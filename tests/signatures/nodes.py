@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from converters.graph.nodes import Graph, Node, TensorShape
+from export_model.converters.graph.nodes import Graph, Node, TensorShape
 
 FLOAT, INT = np.dtype(np.float32), np.dtype(np.int32)
 Dims = Sequence[int | None] | None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 
-from signatures.roles import CONSTANT_NAMES
+from export_model.signatures.roles import CONSTANT_NAMES
 from tests.exporter.test_format_keys import literals
 from tests.exporter.test_imports import MODULES, name_of
 

@@ -10,7 +10,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import Meta, Struct
 
-from signatures.fields import FieldError, Many, Number, Record, Shape, Size, Text, explicit_default, one_of, read
+from export_model.signatures.fields import (
+    FieldError,
+    Many,
+    Number,
+    Record,
+    Shape,
+    Size,
+    Text,
+    explicit_default,
+    one_of,
+    read,
+)
 
 
 class Round(Struct, tag_field="kind", tag="round"):

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from converters.graph.nodes import Graph, NameScope, Node, node_of, normal_ref, ref, split_ref, topological
-from signatures.errors import GraphError
+from export_model.converters.graph.nodes import Graph, NameScope, Node, node_of, normal_ref, ref, split_ref, topological
+from export_model.signatures.errors import GraphError
 from tests.signatures.nodes import constant, graph, op, placeholder
 
 

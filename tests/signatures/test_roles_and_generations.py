@@ -6,9 +6,9 @@ import hashlib
 
 import pytest
 
-from converters.policy.generations import generation, torch_generation
-from signatures.digest import sha256_hex
-from signatures.errors import (
+from export_model.converters.policy.generations import generation, torch_generation
+from export_model.signatures.digest import sha256_hex
+from export_model.signatures.errors import (
     BundleError,
     ExportModelError,
     NotAPolicyError,
@@ -17,7 +17,7 @@ from signatures.errors import (
     SourceError,
     UnsupportedOpError,
 )
-from signatures.roles import INPUT_ROLES, OUTPUT_ROLES, Role, canonical_name, parse_role
+from export_model.signatures.roles import INPUT_ROLES, OUTPUT_ROLES, Role, canonical_name, parse_role
 
 
 @pytest.mark.parametrize(

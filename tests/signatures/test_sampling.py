@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from signatures.roles import Role
-from signatures.sampling import (
+from export_model.signatures.roles import Role
+from export_model.signatures.sampling import (
     BATCHES,
     EXTREMES,
     FAR,
@@ -22,7 +22,7 @@ from signatures.sampling import (
     draw_cases,
     draw_rollout,
 )
-from signatures.spec import Memory, PolicySignature, TensorSpec
+from export_model.signatures.spec import Memory, PolicySignature, TensorSpec
 
 ACTION = TensorSpec("action", Role.CONTINUOUS, "float32", (None, 2))
 

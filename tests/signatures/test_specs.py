@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from signatures.contract import _RANKS, parse_signature, parse_source_map
-from signatures.roles import INPUT_ROLES, Role
-from signatures.spec import Memory, PolicySignature, SourceMap, TensorSpec
+from export_model.signatures.contract import _RANKS, parse_signature, parse_source_map
+from export_model.signatures.roles import INPUT_ROLES, Role
+from export_model.signatures.spec import Memory, PolicySignature, SourceMap, TensorSpec
 
 NAMES = st.text(st.characters(exclude_categories=["C", "Z"]), min_size=1, max_size=12)
 NUMBERS = st.integers(-(2**40), 2**40) | st.floats(allow_nan=False, allow_infinity=False)

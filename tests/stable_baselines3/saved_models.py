@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from converters.graph.run import run_graph
-from converters.policy.policy import Policy
+from export_model.converters.graph.run import run_graph
+from export_model.converters.policy.policy import Policy
 from fixtures.sb3_zip import FOLDER, ROWS, WHOLE, weight
 from fixtures.torch_checkpoint.cases import waves
 from tests.torch_checkpoint.pt_files import Writer, zipped

@@ -11,15 +11,15 @@ from typing import cast
 import numpy as np
 import pytest
 
-from converters.compiler.compile import compile_graph
-from converters.formats.format import WriteOptions
-from converters.formats.registry import FROZEN_GRAPH, LITERT, ONNX, SAVED_MODEL, TFJS
-from converters.policy.policy import Policy
-from converters.runtimes.pool import RuntimePool
-from converters.runtimes.registry import available_runtimes
-from converters.trainers.pytorch.network import Network
-from converters.trainers.pytorch.weights import Weights
-from converters.trainers.stable_baselines3.normaliser import ALONE, Moments, Normaliser
+from export_model.converters.compiler.compile import compile_graph
+from export_model.converters.formats.format import WriteOptions
+from export_model.converters.formats.registry import FROZEN_GRAPH, LITERT, ONNX, SAVED_MODEL, TFJS
+from export_model.converters.policy.policy import Policy
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.converters.runtimes.registry import available_runtimes
+from export_model.converters.trainers.pytorch.network import Network
+from export_model.converters.trainers.pytorch.weights import Weights
+from export_model.converters.trainers.stable_baselines3.normaliser import ALONE, Moments, Normaliser
 
 RATIOS = np.array([0, 10, 1e2, 1e3, 1e4, 1e5, -1e5, 3e5])
 DEVIATION = np.array([1, 0.3, 7, 0.01, 2, 1, 0.37, 0.05])

@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.formats.source import NO_NORMALISER, ReadOptions
-from converters.policy.policy import Policy
-from converters.trainers.stable_baselines3.normaliser import read_normaliser
-from exporter.export.sources import read_source
+from export_model.converters.formats.source import NO_NORMALISER, ReadOptions
+from export_model.converters.policy.policy import Policy
+from export_model.converters.trainers.stable_baselines3.normaliser import read_normaliser
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.errors import ExportModelError, SourceError, UsageError
 from fixtures.goldens import read_npz
 from fixtures.sb3_zip import NORMALISED
-from signatures.errors import ExportModelError, SourceError, UsageError
 from tests.commands import export_model
 from tests.stable_baselines3.saved_models import answered, saved
 

@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.formats.source import ReadOptions
-from converters.graph.run import run_graph
-from converters.policy.policy import Policy
-from exporter.export.sources import read_source
+from export_model.converters.formats.source import ReadOptions
+from export_model.converters.graph.run import run_graph
+from export_model.converters.policy.policy import Policy
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError, SourceError, UsageError
 from fixtures.goldens import read_npz
 from fixtures.sb3_zip import FOLDER, weight
 from fixtures.torch_checkpoint.cases import waves
-from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError, SourceError, UsageError
 from tests.stable_baselines3.saved_models import answered, saved
 from tests.torch_checkpoint.pt_files import Writer, zipped
 

@@ -13,25 +13,25 @@ import numpy as np
 import onnx
 import onnxruntime
 
-from converters.compiler.options import CompileOptions
-from converters.consumers.importable import importable
-from converters.consumers.playable import playable
-from converters.consumers.profile import Profile
-from converters.consumers.unity.checker import UnityVerdict, check_file
-from converters.consumers.unity.consumers import Engine, consumer
-from converters.consumers.unity.settings import Brain, sensors_of
-from converters.formats.barracuda.format import NnModel, parse
-from converters.formats.format import WriteOptions
-from converters.formats.onnx import messages
-from converters.formats.onnx.edit import lift_draws
-from converters.formats.registry import format_for_writing
-from converters.formats.source import ReadOptions
-from converters.graph.ops.barracuda.vocabulary import LayerType
-from converters.graph.run import run_graph
-from converters.policy.policy import Policy
-from exporter.export.sources import read_source
-from signatures.roles import OBSERVATIONS, Role
-from signatures.spec import TensorSpec
+from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.consumers.importable import importable
+from export_model.converters.consumers.playable import playable
+from export_model.converters.consumers.profile import Profile
+from export_model.converters.consumers.unity.checker import UnityVerdict, check_file
+from export_model.converters.consumers.unity.consumers import Engine, consumer
+from export_model.converters.consumers.unity.settings import Brain, sensors_of
+from export_model.converters.formats.barracuda.format import NnModel, parse
+from export_model.converters.formats.format import WriteOptions
+from export_model.converters.formats.onnx import messages
+from export_model.converters.formats.onnx.edit import lift_draws
+from export_model.converters.formats.registry import format_for_writing
+from export_model.converters.formats.source import ReadOptions
+from export_model.converters.graph.ops.barracuda.vocabulary import LayerType
+from export_model.converters.graph.run import run_graph
+from export_model.converters.policy.policy import Policy
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.roles import OBSERVATIONS, Role
+from export_model.signatures.spec import TensorSpec
 from tests.barracuda.nn_safety import assert_safe
 from tests.barracuda.reference import evaluate
 

@@ -17,16 +17,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from converters.consumers.profile import Profile
-from converters.consumers.profiles import PROFILES
-from converters.consumers.unity.checker import check_file
-from converters.consumers.unity.consumers import consumer
-from converters.formats.barracuda.writer import encode
-from converters.formats.source import ReadOptions
-from converters.policy.policy import Policy
-from converters.runtimes.pool import RuntimePool
-from exporter.export.sources import read_source
-from signatures.errors import ExportModelError
+from export_model.converters.consumers.profile import Profile
+from export_model.converters.consumers.profiles import PROFILES
+from export_model.converters.consumers.unity.checker import check_file
+from export_model.converters.consumers.unity.consumers import consumer
+from export_model.converters.formats.barracuda.writer import encode
+from export_model.converters.formats.source import ReadOptions
+from export_model.converters.policy.policy import Policy
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.errors import ExportModelError
 from tests.barracuda.test_writer import assert_answers
 from tests.barracuda.test_writer import written as written_nn
 from tests.corpus.conftest import SHARED

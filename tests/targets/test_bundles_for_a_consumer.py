@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from exporter import export_model, load_policy
-from exporter.export.pipeline import ExportResult
-from signatures.errors import UsageError
+from export_model.exporter import export_model, load_policy
+from export_model.exporter.export.pipeline import ExportResult
+from export_model.signatures.errors import UsageError
 from tests import commands
 
 pytest.importorskip("onnxruntime")

@@ -12,14 +12,14 @@ from pathlib import Path
 import onnx
 import pytest
 
-from converters.consumers.unity.constructs import Model, constructs
-from converters.consumers.unity.importers import IMPORTERS
-from converters.consumers.unity.readings import MEASURED, Reading, misreadings
-from converters.formats.format import WriteOptions
-from converters.formats.onnx.writer import write
-from converters.policy.policy import Policy
-from exporter.export.sources import read_source
-from signatures.errors import UnsupportedOpError
+from export_model.converters.consumers.unity.constructs import Model, constructs
+from export_model.converters.consumers.unity.importers import IMPORTERS
+from export_model.converters.consumers.unity.readings import MEASURED, Reading, misreadings
+from export_model.converters.formats.format import WriteOptions
+from export_model.converters.formats.onnx.writer import write
+from export_model.converters.policy.policy import Policy
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.errors import UnsupportedOpError
 from tests import known
 from tests.graph.harness import policy_of
 from tests.graph.samples import SAMPLES, Sample

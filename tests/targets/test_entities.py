@@ -16,8 +16,8 @@ pytest.importorskip("onnxruntime")
 
 import numpy as np
 
-from converters.consumers.profiles import profile
-from signatures.errors import ProfileError
+from export_model.converters.consumers.profiles import profile
+from export_model.signatures.errors import ProfileError
 from tests.targets.dressed import Pair, as_written, compiled
 
 FOREIGN = Path(__file__).resolve().parents[3] / "shared" / "foreign"

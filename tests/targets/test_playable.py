@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 from onnx import TensorProto, helper
 
-from converters.consumers.playable import playable
-from converters.consumers.profiles import PROFILES, profile
-from converters.consumers.unity.consumers import CONSUMERS, EARLIER, consumer
-from converters.files.chunks import Pieces
-from signatures.errors import ProfileError
+from export_model.converters.consumers.playable import playable
+from export_model.converters.consumers.profiles import PROFILES, profile
+from export_model.converters.consumers.unity.consumers import CONSUMERS, EARLIER, consumer
+from export_model.converters.files.chunks import Pieces
+from export_model.signatures.errors import ProfileError
 from tests.unity.policies import Draft
 
 

@@ -12,19 +12,19 @@ import numpy as np
 import onnx
 import pytest
 
-from converters.compiler.options import CompileOptions, NoiseMode
-from converters.consumers.profile import Profile
-from converters.consumers.profiles import PROFILES, profile
-from converters.formats.barracuda.format import parse
-from converters.formats.frozen_graph.reader import read_graph
-from converters.graph.run import run_graph
-from converters.graph.shapes import infer_types
-from converters.graph.types import BATCH
-from converters.policy.policy import Policy
-from exporter import export_model, load_policy
-from exporter.verify.checks.consumer import consumers
-from signatures.contract import EMBEDDED
-from signatures.errors import ProfileError, UsageError
+from export_model.converters.compiler.options import CompileOptions, NoiseMode
+from export_model.converters.consumers.profile import Profile
+from export_model.converters.consumers.profiles import PROFILES, profile
+from export_model.converters.formats.barracuda.format import parse
+from export_model.converters.formats.frozen_graph.reader import read_graph
+from export_model.converters.graph.run import run_graph
+from export_model.converters.graph.shapes import infer_types
+from export_model.converters.graph.types import BATCH
+from export_model.converters.policy.policy import Policy
+from export_model.exporter import export_model, load_policy
+from export_model.exporter.verify.checks.consumer import consumers
+from export_model.signatures.contract import EMBEDDED
+from export_model.signatures.errors import ProfileError, UsageError
 from tests import commands, known
 from tests.handmade import NodeDef, constant, dense, graph_bytes, node, placeholder, sampled_policy
 from tests.targets.dressed import Pair, Plain, compiled, runner_of

@@ -10,10 +10,10 @@ from typing import Any
 import onnx
 import pytest
 
-from converters.consumers.unity.constructs import constructs
-from converters.consumers.unity.exceptions import exception_of
-from converters.consumers.unity.importers import IMPORTERS
-from converters.consumers.unity.readings import MEASURED, RULES, Reading, misreadings
+from export_model.converters.consumers.unity.constructs import constructs
+from export_model.converters.consumers.unity.exceptions import exception_of
+from export_model.converters.consumers.unity.importers import IMPORTERS
+from export_model.converters.consumers.unity.readings import MEASURED, RULES, Reading, misreadings
 
 RULES_FOLDER = Path(__file__).resolve().parents[3] / "shared" / "unity" / "onnx_rules"
 

@@ -14,17 +14,23 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from converters.files.fetch import Fetched
-from converters.formats.tfjs.reader import read_model
-from converters.formats.tfjs.unfuse import unfuse
-from converters.graph.nodes import Graph, Node, TensorShape
-from converters.graph.run import run_graph
-from exporter.export.pipeline import ExportOptions, export
-from exporter.export.sources import read_source
+from export_model.converters.files.fetch import Fetched
+from export_model.converters.formats.tfjs.reader import read_model
+from export_model.converters.formats.tfjs.unfuse import unfuse
+from export_model.converters.graph.nodes import Graph, Node, TensorShape
+from export_model.converters.graph.run import run_graph
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.errors import (
+    DamagedFileError,
+    ExportModelError,
+    NotAPolicyError,
+    SourceError,
+    UnsupportedOpError,
+)
+from export_model.signatures.sampling import draw_cases
 from fixtures import FIXTURES
 from fixtures import path as fixture
-from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError, SourceError, UnsupportedOpError
-from signatures.sampling import draw_cases
 from tests.saved_model.models import assert_agrees, roles
 
 OFFICIAL = Path(__file__).with_name("official")
@@ -235,7 +241,7 @@ SLOPES = np.array([0.1, 0.2, 0.3], np.float32)
     ],
 )
 def test_fused_ops_are_taken_apart(steps: tuple[str, ...], extra: dict[str, np.ndarray], wanted: np.ndarray) -> None:
-    from converters.compiler.passes.normalise import normalise
+    from export_model.converters.compiler.passes.normalise import normalise
 
     attrs = {"leakyrelu_alpha": 0.3} if "LeakyRelu" in steps else {}
     made = unfuse(fused("_FusedMatMul", steps, extra, **attrs))

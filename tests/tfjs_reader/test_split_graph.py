@@ -9,17 +9,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.files import tensorflow_messages as schema
-from converters.formats.frozen_graph.reader import read_graph
-from converters.formats.frozen_graph.tensors import to_array
-from converters.formats.tfjs.split_graph import GRAPH, MANIFEST
-from converters.graph.run import run_graph
-from exporter.export.pipeline import ExportOptions, export
-from exporter.export.sources import read_source
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.formats.frozen_graph.reader import read_graph
+from export_model.converters.formats.frozen_graph.tensors import to_array
+from export_model.converters.formats.tfjs.split_graph import GRAPH, MANIFEST
+from export_model.converters.graph.run import run_graph
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.errors import DamagedFileError, ExportModelError, SourceError
+from export_model.signatures.roles import Role
+from export_model.signatures.sampling import draw_cases
 from fixtures import FIXTURES, path
-from signatures.errors import DamagedFileError, ExportModelError, SourceError
-from signatures.roles import Role
-from signatures.sampling import draw_cases
 from tests.handmade import constant, graph_bytes, node, placeholder
 
 _NARROW = {"int64": "int32", "float64": "float32", "float16": "float32"}

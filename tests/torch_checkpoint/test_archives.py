@@ -18,11 +18,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from converters.files.torch_archive import Archive
-from converters.files.unpickle import Tensor, unpickle
-from exporter.export.sources import read_source
+from export_model.converters.files.torch_archive import Archive
+from export_model.converters.files.unpickle import Tensor, unpickle
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError
 from fixtures.torch_checkpoint import FOLDER
-from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError
 from tests.commands import export_model
 from tests.torch_checkpoint.pt_files import Call, Stored, Writer, actor, checkpoint, pickled, zipped
 

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.files.unpickle import unpickle
-from converters.formats.source import ReadOptions
-from converters.graph.run import run_graph
-from exporter.export.sources import read_source
+from export_model.converters.files.unpickle import unpickle
+from export_model.converters.formats.source import ReadOptions
+from export_model.converters.graph.run import run_graph
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.errors import DamagedFileError, NotAPolicyError
 from fixtures.finished import FOLDER
 from fixtures.goldens import read_npz
-from signatures.errors import DamagedFileError, NotAPolicyError
 from tests.torch_checkpoint.pt_files import Writer, scalar
 
 NAMES = sorted(path.stem for path in FOLDER.glob("*.npz"))

@@ -12,16 +12,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.formats.source import ReadOptions
-from converters.graph.run import run_graph
-from converters.policy.policy import Policy
-from exporter.export.pipeline import ExportOptions, export
-from exporter.export.sources import read_source
-from exporter.reports.summary import failure_lines
+from export_model.converters.formats.source import ReadOptions
+from export_model.converters.graph.run import run_graph
+from export_model.converters.policy.policy import Policy
+from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.export.sources import read_source
+from export_model.exporter.reports.summary import failure_lines
+from export_model.signatures.roles import OBSERVATIONS, Role
 from fixtures.goldens import read_npz
 from fixtures.torch_checkpoint import FOLDER
 from fixtures.torch_checkpoint.cases import CASES, Case
-from signatures.roles import OBSERVATIONS, Role
 from tests.torch_checkpoint.pt_files import checkpoint, weights
 
 STORED = [c for c in CASES if c.stored]

@@ -10,16 +10,16 @@ import numpy as np
 import onnx
 import pytest
 
-from converters.files.fetch import Fetched
-from converters.formats.bundle.bundle import Bundle
-from converters.formats.recognise import recognise_path
-from converters.formats.source import ReadOptions
-from exporter import inspect_model
-from exporter.export.sources import read_source
+from export_model.converters.files.fetch import Fetched
+from export_model.converters.formats.bundle.bundle import Bundle
+from export_model.converters.formats.recognise import recognise_path
+from export_model.converters.formats.source import ReadOptions
+from export_model.exporter import inspect_model
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.errors import DamagedFileError, NotAPolicyError, SourceError, UsageError
+from export_model.signatures.roles import Role
 from fixtures.torch_checkpoint import FOLDER
 from fixtures.torch_checkpoint.cases import CASES, waves
-from signatures.errors import DamagedFileError, NotAPolicyError, SourceError, UsageError
-from signatures.roles import Role
 from tests.commands import export_model
 from tests.torch_checkpoint.pt_files import Writer, actor, checkpoint, weights, zipped
 

@@ -15,13 +15,13 @@ import numpy as np
 import pytest
 import yaml
 
-from converters.formats.source import ReadOptions
-from converters.graph.run import run_graph
-from exporter.export.sources import read_source
+from export_model.converters.formats.source import ReadOptions
+from export_model.converters.graph.run import run_graph
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.errors import SourceError, UsageError
+from export_model.signatures.roles import Role
 from fixtures.goldens import read_npz
 from fixtures.robots import FOLDER, ROWS, STEPS
-from signatures.errors import SourceError, UsageError
-from signatures.roles import Role
 from tests.commands import export_model
 from tests.torch_checkpoint.pt_files import Writer
 from tests.torch_checkpoint.robots import checkpoint, states

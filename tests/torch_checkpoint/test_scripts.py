@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.formats.source import ReadOptions
-from converters.graph.run import run_graph
-from converters.trainers.scripts.choice import known_state
-from converters.trainers.scripts.table import SCRIPTS
-from exporter import inspect_model
-from exporter.export.sources import read_source
+from export_model.converters.formats.source import ReadOptions
+from export_model.converters.graph.run import run_graph
+from export_model.converters.trainers.scripts.choice import known_state
+from export_model.converters.trainers.scripts.table import SCRIPTS
+from export_model.exporter import inspect_model
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.errors import SourceError, UsageError
 from fixtures.state_dicts import FOLDER
 from fixtures.torch_checkpoint.cases import waves
-from signatures.errors import SourceError, UsageError
 from tests.commands import export_model
 from tests.torch_checkpoint.pt_files import Writer
 from tests.torch_checkpoint.test_state_dicts import saved, trunk_of_ones_own
@@ -97,7 +97,7 @@ def test_every_fixture_fits_the_scripts_of_its_names(name: str, tmp_path: Path) 
 
 
 def read_pickle(path: Path) -> Any:
-    from converters.files.torch_archive import Archive
+    from export_model.converters.files.torch_archive import Archive
 
     return Archive(path.read_bytes()).value
 

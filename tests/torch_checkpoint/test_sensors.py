@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.formats.source import ReadOptions
-from converters.graph.run import run_graph
-from converters.policy.policy import Policy
-from exporter.export.sources import read_source
+from export_model.converters.formats.source import ReadOptions
+from export_model.converters.graph.run import run_graph
+from export_model.converters.policy.policy import Policy
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.roles import OBSERVATIONS, Role
 from fixtures.torch_checkpoint import FOLDER
 from fixtures.torch_checkpoint.cases import CASES, waves
-from signatures.roles import OBSERVATIONS, Role
 from tests.commands import export_model
 from tests.torch_checkpoint.pt_files import checkpoint, weights
 

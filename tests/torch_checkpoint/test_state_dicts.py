@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from converters.formats.source import ReadOptions
-from converters.graph.run import run_graph
-from exporter.export.sources import read_source
+from export_model.converters.formats.source import ReadOptions
+from export_model.converters.graph.run import run_graph
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.errors import NotAPolicyError, SourceError, UsageError
+from export_model.signatures.roles import Role
 from fixtures.goldens import read_npz
 from fixtures.state_dicts import FOLDER, ROWS
 from fixtures.torch_checkpoint.cases import waves
-from signatures.errors import NotAPolicyError, SourceError, UsageError
-from signatures.roles import Role
 from tests.commands import export_model
 from tests.torch_checkpoint.pt_files import RETURNS, Writer
 

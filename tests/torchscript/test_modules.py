@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.files.torchscript_archive import ScriptArchive
-from converters.formats.source import ReadOptions
-from converters.graph.run import run_graph
-from converters.policy.policy import Policy
-from exporter.export.sources import read_source
+from export_model.converters.files.torchscript_archive import ScriptArchive
+from export_model.converters.formats.source import ReadOptions
+from export_model.converters.graph.run import run_graph
+from export_model.converters.policy.policy import Policy
+from export_model.exporter.export.sources import read_source
 from fixtures.goldens import read_npz
 from fixtures.torchscript import AGENTS, FOLDER, STEPS
 

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from converters.formats.source import ReadOptions
-from converters.graph.run import run_graph
-from exporter.export.sources import read_source
+from export_model.converters.formats.source import ReadOptions
+from export_model.converters.graph.run import run_graph
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.errors import ExportModelError, UnsupportedOpError, UsageError
 from fixtures.goldens import read_npz
 from fixtures.torchscript import FOLDER
-from signatures.errors import ExportModelError, UnsupportedOpError, UsageError
 from tests.commands import export_model
 
 

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.runtimes.pool import RuntimePool
-from exporter import export_model
-from exporter.play.environments import ENVIRONMENTS
-from exporter.play.environments.tennis import BRAINS
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter import export_model
+from export_model.exporter.play.environments import ENVIRONMENTS
+from export_model.exporter.play.environments.tennis import BRAINS
 from fixtures import trained
 from fixtures.evaluate import Contract, Decide, Player, Score, play, together
 from fixtures.trained.scores import EPISODES, SEED

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from exporter.play.environments import (
+from export_model.exporter.play.environments import (
     ENVIRONMENTS,
     Ball3D,
     Crawler2D,
@@ -23,7 +23,7 @@ from exporter.play.environments import (
     gridworld,
     tennis,
 )
-from exporter.play.environments.base import Environment, Streams
+from export_model.exporter.play.environments.base import Environment, Streams
 from fixtures.evaluate import play, together
 
 Array = np.ndarray[Any, Any]

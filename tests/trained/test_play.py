@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from exporter.play.environments import ENVIRONMENTS
+from export_model.exporter.play.environments import ENVIRONMENTS
 from fixtures import trained
 from fixtures.evaluate import Player, Score, play
 from fixtures.goldens import read_npz

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.formats.frozen_graph.reader import read_graph
-from converters.runtimes.pool import RuntimePool
-from exporter import demo, export_model, inspect_model
-from exporter.play.environments import ENVIRONMENTS
+from export_model.converters.formats.frozen_graph.reader import read_graph
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter import demo, export_model, inspect_model
+from export_model.exporter.play.environments import ENVIRONMENTS
 from fixtures import FOLDER as FIXTURES
 from fixtures import trained
 from fixtures.evaluate import play

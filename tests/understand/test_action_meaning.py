@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from converters.compiler.compile import compile_graph
-from converters.graph.nodes import Graph, Node
-from converters.policy.action import action_meaning
-from signatures.errors import SignatureError
-from signatures.roles import Role
+from export_model.converters.compiler.compile import compile_graph
+from export_model.converters.graph.nodes import Graph, Node
+from export_model.converters.policy.action import action_meaning
+from export_model.signatures.errors import SignatureError
+from export_model.signatures.roles import Role
 from tests.signatures.nodes import FLOAT, constant, graph, op, placeholder
 
 INT64 = np.dtype(np.int64)

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.compiler.passes.outputs import LOG_PROBS, add_companions
-from converters.graph.nodes import Graph
-from converters.graph.shapes import infer_types
-from converters.graph.types import INT64
-from converters.policy.action import ActionMeaning
-from converters.policy.brains import Head
-from signatures.roles import Role
+from export_model.converters.compiler.passes.outputs import LOG_PROBS, add_companions
+from export_model.converters.graph.nodes import Graph
+from export_model.converters.graph.shapes import infer_types
+from export_model.converters.graph.types import INT64
+from export_model.converters.policy.action import ActionMeaning
+from export_model.converters.policy.brains import Head
+from export_model.signatures.roles import Role
 from tests.graph.harness import Array
 from tests.graph.making import const, graph, node, ops, placeholder
 from tests.graph.running import gaussian, mean, value

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from converters.graph.nodes import Graph, Node, TensorShape
-from converters.policy.brains import find_brains
-from converters.policy.inputs import classify_inputs, placeholder_rank, role_by_name
-from signatures.errors import NotAPolicyError, SignatureError, UsageError
-from signatures.roles import Role
+from export_model.converters.graph.nodes import Graph, Node, TensorShape
+from export_model.converters.policy.brains import find_brains
+from export_model.converters.policy.inputs import classify_inputs, placeholder_rank, role_by_name
+from export_model.signatures.errors import NotAPolicyError, SignatureError, UsageError
+from export_model.signatures.roles import Role
 from tests.signatures.nodes import FLOAT, INT, Dims, constant, graph, op, placeholder
 
 

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from converters.compiler.compile import compile_graph
-from converters.formats.frozen_graph.reader import read_graph
-from converters.graph.nodes import Graph, Node
-from converters.policy.memories import memory_layout
-from converters.policy.observations import normaliser
+from export_model.converters.compiler.compile import compile_graph
+from export_model.converters.formats.frozen_graph.reader import read_graph
+from export_model.converters.graph.nodes import Graph, Node
+from export_model.converters.policy.memories import memory_layout
+from export_model.converters.policy.observations import normaliser
 from tests.graph.making import const, graph, node, placeholder
 from tests.graph.samples import f32
 

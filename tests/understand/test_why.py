@@ -11,18 +11,18 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from converters.compiler.compile import explanations
-from converters.formats.onnx.output_roles import _BESIDE, _BY_NAME, output_roles
-from converters.formats.onnx.reader import OnnxModel
-from converters.graph.nodes import Graph, Node
-from converters.policy.brains import _ACTIONS, _DECLARED_ACTIONS, explain_outputs, find_brains
-from converters.policy.input_rules import BY_NAME, BY_READERS, LAST_RESORTS
-from converters.policy.inputs import classify_inputs, explain_inputs
-from converters.policy.rules import Decision
-from exporter import inspect_model
-from exporter.export.sources import read_source
-from signatures.errors import ExportModelError, SignatureError
-from signatures.roles import Role
+from export_model.converters.compiler.compile import explanations
+from export_model.converters.formats.onnx.output_roles import _BESIDE, _BY_NAME, output_roles
+from export_model.converters.formats.onnx.reader import OnnxModel
+from export_model.converters.graph.nodes import Graph, Node
+from export_model.converters.policy.brains import _ACTIONS, _DECLARED_ACTIONS, explain_outputs, find_brains
+from export_model.converters.policy.input_rules import BY_NAME, BY_READERS, LAST_RESORTS
+from export_model.converters.policy.inputs import classify_inputs, explain_inputs
+from export_model.converters.policy.rules import Decision
+from export_model.exporter import inspect_model
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.errors import ExportModelError, SignatureError
+from export_model.signatures.roles import Role
 from tests import commands, known
 from tests.signatures.nodes import FLOAT, INT, Dims, constant, graph, op, placeholder
 

@@ -13,9 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from onnx import TensorProto, helper, numpy_helper
 
-from converters.consumers.unity.checker import check_file
-from converters.consumers.unity.consumers import CONSUMERS
-from signatures.errors import ExportModelError
+from export_model.converters.consumers.unity.checker import check_file
+from export_model.converters.consumers.unity.consumers import CONSUMERS
+from export_model.signatures.errors import ExportModelError
 from tests.commands import ROOT
 from tests.conftest import examples
 from tests.unity.policies import Draft
@@ -114,7 +114,7 @@ def test_a_negative_length_does_not_abort_the_process(tmp_path: Path) -> None:
     model.graph.node.append(helper.make_node("Slice", ["obs_0", "s", "e", "a"], ["cut"]))
     path = tmp_path / "negative.onnx"
     path.write_bytes(model.SerializeToString())
-    command = [sys.executable, "-m", "exporter", "inspect", str(path), "--unity", "all"]
+    command = [sys.executable, "-m", "export_model", "inspect", str(path), "--unity", "all"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, encoding="utf-8", check=False)
     assert done.returncode == 1, done.stderr
     assert "not accepted by R22" in done.stdout
@@ -138,6 +138,6 @@ def test_a_length_that_comes_out_negative_does_not_abort_the_process_either(
     model.graph.node.append(helper.make_node("Slice", ["short", "s", "e"], ["cut"]))
     path = tmp_path / "negative.onnx"
     path.write_bytes(model.SerializeToString())
-    command = [sys.executable, "-m", "exporter", "inspect", str(path), "--unity", "all"]
+    command = [sys.executable, "-m", "export_model", "inspect", str(path), "--unity", "all"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, encoding="utf-8", check=False)
     assert done.returncode in (0, 1), done.stderr

@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 from onnx import TensorProto, helper
 
-from converters.consumers.unity.checker import check_file
-from converters.consumers.unity.consumers import CONSUMERS
-from converters.consumers.unity.importing import refusal
-from converters.consumers.unity.onnx_file import read_onnx_file
+from export_model.converters.consumers.unity.checker import check_file
+from export_model.converters.consumers.unity.consumers import CONSUMERS
+from export_model.converters.consumers.unity.importing import refusal
+from export_model.converters.consumers.unity.onnx_file import read_onnx_file
 from tests.unity.conftest import document, lines
 from tests.unity.policies import Draft
 

@@ -12,13 +12,13 @@ import pytest
 from click.testing import CliRunner, Result
 from onnx import TensorProto, helper
 
-from converters.consumers.mlagents.memory import DRAWN_KEPT
-from converters.consumers.unity.checker import check_file
-from converters.consumers.unity.consumers import CONSUMERS, EARLIER
-from converters.consumers.unity.settings import Brain, sensors_of
-from exporter.cli.app import app
+from export_model.converters.consumers.mlagents.memory import DRAWN_KEPT
+from export_model.converters.consumers.unity.checker import check_file
+from export_model.converters.consumers.unity.consumers import CONSUMERS, EARLIER
+from export_model.converters.consumers.unity.settings import Brain, sensors_of
+from export_model.exporter.cli.app import app
+from export_model.signatures.errors import UsageError
 from fixtures import path as fixture
-from signatures.errors import UsageError
 from tests.commands import export_model, is_refused
 from tests.unity.policies import Draft
 

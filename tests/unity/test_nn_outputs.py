@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.formats.barracuda.format import NnModel, parse
-from converters.formats.barracuda.graph import MEMORY_IN, MEMORY_OUT, to_graph
-from converters.formats.barracuda.layer_builder import node_name
-from converters.graph.nodes import Graph, Node
-from converters.graph.run import run_graph
-from exporter.export.sources import read_source
-from signatures.errors import DamagedFileError
+from export_model.converters.formats.barracuda.format import NnModel, parse
+from export_model.converters.formats.barracuda.graph import MEMORY_IN, MEMORY_OUT, to_graph
+from export_model.converters.formats.barracuda.layer_builder import node_name
+from export_model.converters.graph.nodes import Graph, Node
+from export_model.converters.graph.run import run_graph
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.errors import DamagedFileError
 from tests.unity.conftest import SHARED, lines
 
 pytestmark = pytest.mark.corpus

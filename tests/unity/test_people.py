@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from converters.consumers.unity.checker import check_file
-from converters.consumers.unity.consumers import CONSUMERS
-from converters.consumers.unity.settings import Brain, sensors_of
-from exporter.cli.app import app
-from exporter.inspect.behavior_parameters import behavior_parameters
-from exporter.snippets.contract import read_bundle
-from exporter.snippets.registry import snippets
-from signatures.errors import UsageError
+from export_model.converters.consumers.unity.checker import check_file
+from export_model.converters.consumers.unity.consumers import CONSUMERS
+from export_model.converters.consumers.unity.settings import Brain, sensors_of
+from export_model.exporter.cli.app import app
+from export_model.exporter.inspect.behavior_parameters import behavior_parameters
+from export_model.exporter.snippets.contract import read_bundle
+from export_model.exporter.snippets.registry import snippets
+from export_model.signatures.errors import UsageError
 from tests.commands import ROOT
 from tests.unity.policies import Draft
 

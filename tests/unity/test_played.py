@@ -16,16 +16,16 @@ from typing import Any
 import onnx
 import pytest
 
-from converters.consumers.profiles import profile
-from converters.consumers.unity.checker import check_file
-from converters.consumers.unity.consumers import CONSUMERS, EARLIER
-from converters.consumers.unity.settings import Brain
-from converters.formats.barracuda.format import NnModel, parse
-from converters.formats.source import ReadOptions
-from converters.graph.ops.barracuda.vocabulary import LayerType
-from exporter import export_model
-from exporter.export.sources import read_source
-from signatures.errors import ProfileError, SignatureError, UnsupportedOpError
+from export_model.converters.consumers.profiles import profile
+from export_model.converters.consumers.unity.checker import check_file
+from export_model.converters.consumers.unity.consumers import CONSUMERS, EARLIER
+from export_model.converters.consumers.unity.settings import Brain
+from export_model.converters.formats.barracuda.format import NnModel, parse
+from export_model.converters.formats.source import ReadOptions
+from export_model.converters.graph.ops.barracuda.vocabulary import LayerType
+from export_model.exporter import export_model
+from export_model.exporter.export.sources import read_source
+from export_model.signatures.errors import ProfileError, SignatureError, UnsupportedOpError
 from tests.barracuda.accepted import agent_of
 from tests.barracuda.test_writer import assert_answers
 from tests.known import ABSENT, SHARED

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.consumers.unity.checker import ModeVerdict, check_file
-from converters.consumers.unity.consumers import CONSUMERS, EARLIER, consumer
-from converters.consumers.unity.findings import Thrown
-from converters.consumers.unity.players import PLAYERS, Outcome
-from converters.consumers.unity.settings import Brain, Sensor
+from export_model.converters.consumers.unity.checker import ModeVerdict, check_file
+from export_model.converters.consumers.unity.consumers import CONSUMERS, EARLIER, consumer
+from export_model.converters.consumers.unity.findings import Thrown
+from export_model.converters.consumers.unity.players import PLAYERS, Outcome
+from export_model.converters.consumers.unity.settings import Brain, Sensor
 from tests.unity.conftest import UNITY, lines
 
 pytestmark = pytest.mark.corpus

@@ -12,10 +12,10 @@ from typing import Any
 
 import pytest
 
-from converters.consumers.unity.checker import MODES, UnityVerdict, check_file
-from converters.consumers.unity.consumers import CONSUMERS
-from converters.consumers.unity.findings import Thrown
-from converters.consumers.unity.settings import Brain
+from export_model.converters.consumers.unity.checker import MODES, UnityVerdict, check_file
+from export_model.converters.consumers.unity.consumers import CONSUMERS
+from export_model.converters.consumers.unity.findings import Thrown
+from export_model.converters.consumers.unity.settings import Brain
 from tests.unity.conftest import lines
 
 pytestmark = pytest.mark.corpus

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from onnx import TensorProto, helper
 
-from converters.consumers.unity.checker import ModeVerdict, UnityVerdict, check_file
-from converters.consumers.unity.consumers import CONSUMERS
-from converters.consumers.unity.rules import culture_key
-from converters.consumers.unity.settings import Brain, sensors_of
-from signatures.errors import SourceError, UsageError
+from export_model.converters.consumers.unity.checker import ModeVerdict, UnityVerdict, check_file
+from export_model.converters.consumers.unity.consumers import CONSUMERS
+from export_model.converters.consumers.unity.rules import culture_key
+from export_model.converters.consumers.unity.settings import Brain, sensors_of
+from export_model.signatures.errors import SourceError, UsageError
 from tests.unity.policies import Draft
 
 BRAIN = Brain(continuous=2, sensors=sensors_of([[5]]))
@@ -258,7 +258,7 @@ def test_other_files_are_refused_by_us(tmp_path: Path) -> None:
 def test_behavior_parameters_are_checked(entry: dict[str, Any], tmp_path: Path) -> None:
     import json
 
-    from converters.consumers.unity.settings import read_brain
+    from export_model.converters.consumers.unity.settings import read_brain
 
     path = tmp_path / "brain.json"
     path.write_text(json.dumps(entry))

@@ -15,13 +15,13 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from converters.consumers.unity.channel_order import Order, channel_orders, keeps_last
-from converters.consumers.unity.checker import UnityVerdict, check_file
-from converters.consumers.unity.consumers import CONSUMERS
-from converters.consumers.unity.onnx_file import OnnxFile
-from converters.consumers.unity.settings import Brain, Sensor
-from exporter import export_model
-from signatures.errors import ProfileError
+from export_model.converters.consumers.unity.channel_order import Order, channel_orders, keeps_last
+from export_model.converters.consumers.unity.checker import UnityVerdict, check_file
+from export_model.converters.consumers.unity.consumers import CONSUMERS
+from export_model.converters.consumers.unity.onnx_file import OnnxFile
+from export_model.converters.consumers.unity.settings import Brain, Sensor
+from export_model.exporter import export_model
+from export_model.signatures.errors import ProfileError
 from tests.unity.conftest import ABSENT, UNITY, lines
 
 #: A ``.pt`` alone does not say which columns are whose sensor: ``--sensors`` has tests of its own.

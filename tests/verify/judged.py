@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from converters.compiler.compile import compile_graph
-from converters.compiler.options import CompileOptions
-from converters.formats.frozen_graph.reader import read_graph
-from converters.policy.policy import Policy
-from converters.runtimes.numpy import child
-from converters.runtimes.registry import RuntimeInfo
-from exporter.verify.options import VerifyOptions
-from exporter.verify.participants import Feeds, Participant, policy_under_test
-from exporter.verify.report import ParityReport
-from exporter.verify.session import Session
-from exporter.verify.verification import CHECKS, Check, verify
+from export_model.converters.compiler.compile import compile_graph
+from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.formats.frozen_graph.reader import read_graph
+from export_model.converters.policy.policy import Policy
+from export_model.converters.runtimes.numpy import child
+from export_model.converters.runtimes.registry import RuntimeInfo
+from export_model.exporter.verify.options import VerifyOptions
+from export_model.exporter.verify.participants import Feeds, Participant, policy_under_test
+from export_model.exporter.verify.report import ParityReport
+from export_model.exporter.verify.session import Session
+from export_model.exporter.verify.verification import CHECKS, Check, verify
 from tests.handmade import graph_bytes
 
 Arrays = dict[str, npt.NDArray[Any]]

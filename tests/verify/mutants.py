@@ -173,7 +173,12 @@ def survives(mutant: Mutant) -> bool:
 
 def _preload() -> None:
     """Import what is not broken once, ahead of the forks."""
-    for name in ("pytest", "onnx", "converters.compiler.compile", "converters.runtimes.numpy.child"):
+    for name in (
+        "pytest",
+        "onnx",
+        "export_model.converters.compiler.compile",
+        "export_model.converters.runtimes.numpy.child",
+    ):
         importlib.import_module(name)
 
 

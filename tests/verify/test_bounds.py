@@ -9,16 +9,16 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from converters.files.children.process import RunFailedError
-from exporter.verify import rounding
-from exporter.verify.checks.decisions import LIMITS, compare_decisions, decisions
-from exporter.verify.difference import compare, compare_all, floor_log_probs, spread, ties
-from exporter.verify.participants import policy_under_test
-from exporter.verify.session import Session
-from exporter.verify.statistics import chi_square_survival, dependent, fit, fit_all, same_distribution
-from exporter.verify.tolerances import Tolerance
-from exporter.verify.work import Allowance, products
-from signatures.sampling import Case
+from export_model.converters.files.children.process import RunFailedError
+from export_model.exporter.verify import rounding
+from export_model.exporter.verify.checks.decisions import LIMITS, compare_decisions, decisions
+from export_model.exporter.verify.difference import compare, compare_all, floor_log_probs, spread, ties
+from export_model.exporter.verify.participants import policy_under_test
+from export_model.exporter.verify.session import Session
+from export_model.exporter.verify.statistics import chi_square_survival, dependent, fit, fit_all, same_distribution
+from export_model.exporter.verify.tolerances import Tolerance
+from export_model.exporter.verify.work import Allowance, products
+from export_model.signatures.sampling import Case
 from tests.handmade import continuous_policy
 from tests.verify.judged import KNOWN, Pool, compiled
 
@@ -240,7 +240,7 @@ def test_draws_that_repeat_are_dependent() -> None:
 
 
 def test_a_slow_runtime_gets_as_many_rows_as_it_has_time_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("exporter.verify.work._SPEEDS", {"slow": 100.0})
+    monkeypatch.setattr("export_model.exporter.verify.work._SPEEDS", {"slow": 100.0})
     left = Allowance(cost=10, runtime="slow")
     assert left.left == 200 and left.takes(150, "a") and not left.takes(51, "b") and left.takes(50, "c")
     assert left.note("it") == "it is slow (1e-05 million products for a row); left out there: b"

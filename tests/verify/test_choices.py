@@ -9,10 +9,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from converters.policy.policy import Policy
-from exporter.verify.checks.numbers import numbers
-from exporter.verify.choices import Choices, broken_ties
-from exporter.verify.tolerances import Tolerance
+from export_model.converters.policy.policy import Policy
+from export_model.exporter.verify.checks.numbers import numbers
+from export_model.exporter.verify.choices import Choices, broken_ties
+from export_model.exporter.verify.tolerances import Tolerance
 from tests.handmade import constant, node, placeholder
 from tests.verify.judged import Feeds, compiled, judge, spoiling, wrong
 

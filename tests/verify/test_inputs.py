@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from exporter.verify.checks.numbers import numbers
-from signatures.sampling import HUGE_BATCH, draw_cases
+from export_model.exporter.verify.checks.numbers import numbers
+from export_model.signatures.sampling import HUGE_BATCH, draw_cases
 from tests.handmade import constant, continuous_policy, dense, node, placeholder
 from tests.verify.judged import Feeds, compiled, judge, spoiling, wrong
 

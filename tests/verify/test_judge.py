@@ -10,14 +10,14 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from converters.compiler.options import CompileOptions
-from converters.graph.run import run_graph
-from converters.policy.policy import Policy
-from exporter.verify.checks.draws import draws
-from exporter.verify.checks.numbers import numbers
-from exporter.verify.checks.rollout import rollout
-from exporter.verify.options import VerifyOptions
-from exporter.verify.tolerances import Tolerance
+from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.graph.run import run_graph
+from export_model.converters.policy.policy import Policy
+from export_model.exporter.verify.checks.draws import draws
+from export_model.exporter.verify.checks.numbers import numbers
+from export_model.exporter.verify.checks.rollout import rollout
+from export_model.exporter.verify.options import VerifyOptions
+from export_model.exporter.verify.tolerances import Tolerance
 from tests.handmade import constant, continuous_policy, dense, node, placeholder, sampled_policy
 from tests.verify.judged import Arrays, Feeds, compiled, judge, spoiling, wrong
 

@@ -12,14 +12,14 @@ from typing import TypeVar
 import numpy as np
 from msgspec.structs import replace
 
-from converters.graph.nodes import Graph, NameScope, Node, topological
-from converters.interfaces.isaac_lab import RAW_ACTION
-from converters.interfaces.registry import LEFT_OUT
-from converters.policy.policy import Policy
-from signatures.errors import UsageError
-from signatures.interface import Interface, Range, Term
-from signatures.roles import Role
-from signatures.spec import PolicySignature
+from export_model.converters.graph.nodes import Graph, NameScope, Node, topological
+from export_model.converters.interfaces.isaac_lab import RAW_ACTION
+from export_model.converters.interfaces.registry import LEFT_OUT
+from export_model.converters.policy.policy import Policy
+from export_model.signatures.errors import UsageError
+from export_model.signatures.interface import Interface, Range, Term
+from export_model.signatures.roles import Role
+from export_model.signatures.spec import PolicySignature
 
 NOTE = "the graph computes scale, offset and clip of the action (--bake actions); apply nothing to it"
 ALREADY = "--bake actions had nothing to do: the source's graph computes scale, offset and clip of the action already"

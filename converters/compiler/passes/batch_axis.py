@@ -11,13 +11,13 @@ from collections.abc import Mapping, Sequence
 
 from msgspec.structs import replace
 
-from converters.compiler.passes.normalise import normalise
-from converters.compiler.passes.vmap import for_every_row
-from converters.compiler.passes.vmap_trial import check_rows, too_large
-from converters.graph.nodes import Graph, TensorShape, topological
-from converters.graph.ops.table import is_fed
-from converters.graph.shapes import infer_types
-from signatures.errors import ExportModelError
+from export_model.converters.compiler.passes.normalise import normalise
+from export_model.converters.compiler.passes.vmap import for_every_row
+from export_model.converters.compiler.passes.vmap_trial import check_rows, too_large
+from export_model.converters.graph.nodes import Graph, TensorShape, topological
+from export_model.converters.graph.ops.table import is_fed
+from export_model.converters.graph.shapes import infer_types
+from export_model.signatures.errors import ExportModelError
 
 Dims = tuple[int, ...]
 

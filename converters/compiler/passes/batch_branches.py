@@ -12,13 +12,13 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 
 import numpy as np
 
-from converters.compiler.passes.slice_of_concat import slice_of_columns
-from converters.graph.editor import Editor
-from converters.graph.nodes import Graph, Node, node_of, ref, split_ref
-from converters.graph.ops.slicing import strided_steps
-from converters.graph.ops.table import op_of
-from converters.graph.shapes import Types, infer_types
-from converters.graph.types import FLOAT32
+from export_model.converters.compiler.passes.slice_of_concat import slice_of_columns
+from export_model.converters.graph.editor import Editor
+from export_model.converters.graph.nodes import Graph, Node, node_of, ref, split_ref
+from export_model.converters.graph.ops.slicing import strided_steps
+from export_model.converters.graph.ops.table import op_of
+from export_model.converters.graph.shapes import Types, infer_types
+from export_model.converters.graph.types import FLOAT32
 
 #: Columns of all parts together, for sums of parts: they are a product with as many rows.
 _MOST_SUMMED = 64

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from msgspec.structs import replace
 
-from converters.compiler.compilation import Compilation
-from converters.graph.editor import Editor
-from converters.graph.nodes import node_of
-from converters.graph.shapes import infer_types
-from converters.graph.types import INT64
-from converters.policy.action import action_meaning
-from converters.policy.action_values import (
+from export_model.converters.compiler.compilation import Compilation
+from export_model.converters.graph.editor import Editor
+from export_model.converters.graph.nodes import node_of
+from export_model.converters.graph.shapes import infer_types
+from export_model.converters.graph.types import INT64
+from export_model.converters.policy.action import action_meaning
+from export_model.converters.policy.action_values import (
     EVIDENCE,
     Candidate,
     evidence_of,
@@ -21,8 +21,8 @@ from converters.policy.action_values import (
     may_be_values,
     says_action,
 )
-from signatures.errors import NotAPolicyError, SignatureError
-from signatures.roles import CANONICAL, Role
+from export_model.signatures.errors import NotAPolicyError, SignatureError
+from export_model.signatures.roles import CANONICAL, Role
 
 _VALUES = CANONICAL[Role.Q_VALUES]
 _ACTION = "action"

@@ -10,11 +10,11 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from converters.graph.nodes import Graph, NameScope, Node, normal_ref
-from converters.graph.ops.table import op_of
-from converters.graph.shapes import Types, infer_types, run_kernel
-from converters.graph.size_limits import Allowance
-from converters.graph.types import BATCH
+from export_model.converters.graph.nodes import Graph, NameScope, Node, normal_ref
+from export_model.converters.graph.ops.table import op_of
+from export_model.converters.graph.shapes import Types, infer_types, run_kernel
+from export_model.converters.graph.size_limits import Allowance
+from export_model.converters.graph.types import BATCH
 
 
 def broadcast_rows(graph: Graph, fetches: Iterable[str]) -> Graph:

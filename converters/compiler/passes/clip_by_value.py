@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from converters.graph.editor import Editor
-from converters.graph.nodes import Graph, Node, node_of
-from converters.graph.types import FLOAT32
+from export_model.converters.graph.editor import Editor
+from export_model.converters.graph.nodes import Graph, Node, node_of
+from export_model.converters.graph.types import FLOAT32
 
 
 def clip_by_value(graph: Graph, roots: Iterable[str]) -> Graph:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from converters.compiler.compilation import Compilation
-from converters.compiler.passes.noise import samplers
-from converters.graph.nodes import Node, ref
-from converters.graph.ops.table import CONTROL_FLOW, TABLE, op_of, traits
-from converters.graph.shapes import infer_types
-from signatures.roles import Role
+from export_model.converters.compiler.compilation import Compilation
+from export_model.converters.compiler.passes.noise import samplers
+from export_model.converters.graph.nodes import Node, ref
+from export_model.converters.graph.ops.table import CONTROL_FLOW, TABLE, op_of, traits
+from export_model.converters.graph.shapes import infer_types
+from export_model.signatures.roles import Role
 
 
 def pinned_outputs(c: Compilation) -> str | None:

@@ -10,11 +10,11 @@ from collections.abc import Hashable, Iterable
 
 import numpy as np
 
-from converters.graph.editor import Editor
-from converters.graph.nodes import Graph, Node, node_of, ref, split_ref
-from converters.graph.ops.table import op_of
-from converters.graph.shapes import infer_types
-from converters.graph.types import FLOAT32
+from export_model.converters.graph.editor import Editor
+from export_model.converters.graph.nodes import Graph, Node, node_of, ref, split_ref
+from export_model.converters.graph.ops.table import op_of
+from export_model.converters.graph.shapes import infer_types
+from export_model.converters.graph.types import FLOAT32
 
 #: A constant above as many elements is left alone, and not compared with others.
 _SMALL = 1 << 12

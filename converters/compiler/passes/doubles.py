@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from msgspec.structs import replace
 
-from converters.graph.nodes import Graph, Node
-from converters.graph.types import FLOAT32
-from converters.policy.facts import DOUBLES_NARROWED, SourceFacts
+from export_model.converters.graph.nodes import Graph, Node
+from export_model.converters.graph.types import FLOAT32
+from export_model.converters.policy.facts import DOUBLES_NARROWED, SourceFacts
 
 _FLOAT64 = np.dtype(np.float64)
 

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from converters.graph.editor import Editor
-from converters.graph.nodes import Graph, ref
-from converters.graph.ops.table import op_of
-from converters.graph.shapes import infer_types, outputs_of
-from converters.graph.types import INT32
+from export_model.converters.graph.editor import Editor
+from export_model.converters.graph.nodes import Graph, ref
+from export_model.converters.graph.ops.table import op_of
+from export_model.converters.graph.shapes import infer_types, outputs_of
+from export_model.converters.graph.types import INT32
 
 
 def fold(graph: Graph) -> Graph:

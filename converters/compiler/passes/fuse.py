@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from converters.graph.editor import Editor
-from converters.graph.nodes import Graph, Node, node_of
-from converters.graph.ops.table import op_of
+from export_model.converters.graph.editor import Editor
+from export_model.converters.graph.nodes import Graph, Node, node_of
+from export_model.converters.graph.ops.table import op_of
 
 
 def fuse(graph: Graph, roots: Iterable[str], *, activations: bool) -> Graph:

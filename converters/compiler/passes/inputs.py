@@ -8,17 +8,17 @@ from collections.abc import Mapping
 import numpy as np
 from msgspec.structs import replace
 
-from converters.compiler.passes.normalise import as_placeholder
-from converters.graph.editor import Editor
-from converters.graph.nodes import Graph, Node, TensorShape, downstream, node_of, topological
-from converters.graph.ops.base import Layer
-from converters.graph.ops.loops.layers import window_padding
-from converters.graph.ops.table import is_fed, traits
-from converters.graph.shapes import MAX_ELEMENTS
-from converters.graph.types import INT32
-from converters.policy.inputs import placeholder_rank
-from signatures.errors import GraphError, UsageError
-from signatures.roles import OBSERVATIONS, Role
+from export_model.converters.compiler.passes.normalise import as_placeholder
+from export_model.converters.graph.editor import Editor
+from export_model.converters.graph.nodes import Graph, Node, TensorShape, downstream, node_of, topological
+from export_model.converters.graph.ops.base import Layer
+from export_model.converters.graph.ops.loops.layers import window_padding
+from export_model.converters.graph.ops.table import is_fed, traits
+from export_model.converters.graph.shapes import MAX_ELEMENTS
+from export_model.converters.graph.types import INT32
+from export_model.converters.policy.inputs import placeholder_rank
+from export_model.signatures.errors import GraphError, UsageError
+from export_model.signatures.roles import OBSERVATIONS, Role
 
 _LARGEST_IMAGE = 512
 

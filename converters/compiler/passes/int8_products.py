@@ -14,9 +14,9 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 
-from converters.compiler.passes.weights import are_steps, compact
-from converters.graph.editor import Editor
-from converters.graph.nodes import Graph, Node
+from export_model.converters.compiler.passes.weights import are_steps, compact
+from export_model.converters.graph.editor import Editor
+from export_model.converters.graph.nodes import Graph, Node
 
 
 def multiply_products(graph: Graph, roots: Collection[str] = ()) -> Graph:

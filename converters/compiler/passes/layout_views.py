@@ -10,10 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-from converters.graph.editor import Editor
-from converters.graph.nodes import Graph, Node
-from converters.graph.shapes import infer_types
-from converters.graph.types import Dim
+from export_model.converters.graph.editor import Editor
+from export_model.converters.graph.nodes import Graph, Node
+from export_model.converters.graph.shapes import infer_types
+from export_model.converters.graph.types import Dim
 
 _TO_LAST, _TO_FIRST = (0, 2, 3, 1), (0, 3, 1, 2)
 

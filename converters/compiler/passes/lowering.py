@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from functools import partial
 
-from converters.graph.editor import Editor
-from converters.graph.nodes import Graph, Node
-from converters.graph.ops.base import OpDef
-from converters.graph.ops.rewriting import GraphBuilder, Tfjs
-from converters.graph.ops.table import op_of
-from converters.graph.shapes import Types, infer_types
-from signatures.errors import UnsupportedOpError
+from export_model.converters.graph.editor import Editor
+from export_model.converters.graph.nodes import Graph, Node
+from export_model.converters.graph.ops.base import OpDef
+from export_model.converters.graph.ops.rewriting import GraphBuilder, Tfjs
+from export_model.converters.graph.ops.table import op_of
+from export_model.converters.graph.shapes import Types, infer_types
+from export_model.signatures.errors import UnsupportedOpError
 
 
 def lower_for_tfjs(graph: Graph, roots: Collection[str] = ()) -> Graph:

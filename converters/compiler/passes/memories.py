@@ -9,18 +9,18 @@ from collections.abc import Mapping, Sequence
 from msgspec import Struct, field
 from msgspec.structs import replace
 
-from converters.compiler.options import CompileOptions
-from converters.graph.editor import Editor
-from converters.graph.nodes import Graph, Node, TensorShape, joined_name, node_of, normal_ref, split_ref
-from converters.graph.shapes import infer_types
-from converters.graph.types import FLOAT32, static_shape
-from converters.policy.facts import SourceFacts
-from converters.policy.inputs import role_by_name
-from converters.policy.memories import paired_memories
-from converters.policy.rules import Decision
-from signatures.errors import SignatureError
-from signatures.memories import SeparateMemory, SourcePart
-from signatures.roles import ACTING, CANONICAL, Role
+from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.graph.editor import Editor
+from export_model.converters.graph.nodes import Graph, Node, TensorShape, joined_name, node_of, normal_ref, split_ref
+from export_model.converters.graph.shapes import infer_types
+from export_model.converters.graph.types import FLOAT32, static_shape
+from export_model.converters.policy.facts import SourceFacts
+from export_model.converters.policy.inputs import role_by_name
+from export_model.converters.policy.memories import paired_memories
+from export_model.converters.policy.rules import Decision
+from export_model.signatures.errors import SignatureError
+from export_model.signatures.memories import SeparateMemory, SourcePart
+from export_model.signatures.roles import ACTING, CANONICAL, Role
 
 
 class Joined(Struct, frozen=True):

@@ -12,13 +12,13 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from converters.compiler.compilation import Compilation
-from converters.graph.editor import Editor
-from converters.graph.nodes import Graph, Node
-from converters.graph.ops.table import passes_on, traits
-from converters.graph.shapes import infer_types
-from converters.graph.types import FLOAT32, INT64
-from converters.policy.action import clips_nothing
+from export_model.converters.compiler.compilation import Compilation
+from export_model.converters.graph.editor import Editor
+from export_model.converters.graph.nodes import Graph, Node
+from export_model.converters.graph.ops.table import passes_on, traits
+from export_model.converters.graph.shapes import infer_types
+from export_model.converters.graph.types import FLOAT32, INT64
+from export_model.converters.policy.action import clips_nothing
 
 #: Stands for probability 0 where its logarithm is taken.
 _NEVER = 1e-30

@@ -7,11 +7,11 @@ from collections.abc import Mapping
 import numpy as np
 from msgspec.structs import replace
 
-from converters.compiler.compilation import Compilation
-from converters.graph.nodes import Graph, NameScope, Node, node_of, renamed_ref, split_ref, topological
-from converters.graph.ops.table import traits
-from signatures.contract import EMBEDDED
-from signatures.roles import Constant, Role
+from export_model.converters.compiler.compilation import Compilation
+from export_model.converters.graph.nodes import Graph, NameScope, Node, node_of, renamed_ref, split_ref, topological
+from export_model.converters.graph.ops.table import traits
+from export_model.signatures.contract import EMBEDDED
+from export_model.signatures.roles import Constant, Role
 
 
 def name_ports(c: Compilation) -> Compilation:

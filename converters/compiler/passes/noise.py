@@ -12,16 +12,16 @@ from collections.abc import Collection, Mapping, Sequence
 import numpy as np
 from msgspec.structs import replace
 
-from converters.compiler.compilation import Compilation
-from converters.compiler.options import NoiseMode
-from converters.graph.editor import Editor
-from converters.graph.nodes import Graph, Node, TensorShape
-from converters.graph.ops.table import is_fed, op_of, traits
-from converters.graph.shapes import infer_types
-from converters.graph.size_limits import MAX_MADE, Allowance
-from converters.graph.types import BATCH, FLOAT32, Dim, static_shape
-from signatures.errors import UnsupportedOpError
-from signatures.roles import Role
+from export_model.converters.compiler.compilation import Compilation
+from export_model.converters.compiler.options import NoiseMode
+from export_model.converters.graph.editor import Editor
+from export_model.converters.graph.nodes import Graph, Node, TensorShape
+from export_model.converters.graph.ops.table import is_fed, op_of, traits
+from export_model.converters.graph.shapes import infer_types
+from export_model.converters.graph.size_limits import MAX_MADE, Allowance
+from export_model.converters.graph.types import BATCH, FLOAT32, Dim, static_shape
+from export_model.signatures.errors import UnsupportedOpError
+from export_model.signatures.roles import Role
 
 
 def samplers(graph: Graph) -> list[Node]:

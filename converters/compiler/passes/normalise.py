@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 from msgspec.structs import replace
 
-from converters.graph.editor import Editor
-from converters.graph.nn.convolution import Window, conv2d
-from converters.graph.nodes import Graph, Node, TensorShape
-from converters.graph.ops.base import MISFIT, REQUIRED, Attr, AttrKind, misfit
-from converters.graph.ops.older import TO_NCHW, TO_NHWC
-from converters.graph.ops.table import CONTROL_FLOW, SPELLINGS, TABLE, op_of, unsupported_error
-from converters.graph.types import FLOAT32, INT64
-from signatures.errors import GraphError, UnsupportedOpError
+from export_model.converters.graph.editor import Editor
+from export_model.converters.graph.nn.convolution import Window, conv2d
+from export_model.converters.graph.nodes import Graph, Node, TensorShape
+from export_model.converters.graph.ops.base import MISFIT, REQUIRED, Attr, AttrKind, misfit
+from export_model.converters.graph.ops.older import TO_NCHW, TO_NHWC
+from export_model.converters.graph.ops.table import CONTROL_FLOW, SPELLINGS, TABLE, op_of, unsupported_error
+from export_model.converters.graph.types import FLOAT32, INT64
+from export_model.signatures.errors import GraphError, UnsupportedOpError
 
 
 def normalise(graph: Graph, keep: Sequence[str] = ()) -> Graph:

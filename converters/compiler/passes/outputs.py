@@ -12,18 +12,18 @@ from collections.abc import Mapping, Sequence
 
 from msgspec.structs import replace
 
-from converters.compiler.compilation import Compilation
-from converters.compiler.passes.noise import without_noise
-from converters.compiler.passes.normalise import normalise
-from converters.graph.editor import Editor
-from converters.graph.nodes import Graph, normal_ref
-from converters.graph.ops.table import traits
-from converters.graph.shapes import infer_types
-from converters.graph.types import FLOAT32, INT64, static_shape
-from converters.policy.action import ActionMeaning
-from converters.policy.brains import Head
-from signatures.errors import GraphError, SignatureError, UnsupportedOpError
-from signatures.roles import OBSERVATIONS, Role
+from export_model.converters.compiler.compilation import Compilation
+from export_model.converters.compiler.passes.noise import without_noise
+from export_model.converters.compiler.passes.normalise import normalise
+from export_model.converters.graph.editor import Editor
+from export_model.converters.graph.nodes import Graph, normal_ref
+from export_model.converters.graph.ops.table import traits
+from export_model.converters.graph.shapes import infer_types
+from export_model.converters.graph.types import FLOAT32, INT64, static_shape
+from export_model.converters.policy.action import ActionMeaning
+from export_model.converters.policy.brains import Head
+from export_model.signatures.errors import GraphError, SignatureError, UnsupportedOpError
+from export_model.signatures.roles import OBSERVATIONS, Role
 
 LOG_PROBS = "action_log_probs"
 

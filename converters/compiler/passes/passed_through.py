@@ -6,14 +6,14 @@ from collections.abc import Mapping
 
 from msgspec.structs import replace
 
-from converters.compiler.options import CompileOptions
-from converters.graph.nodes import Graph, node_of, normal_ref
-from converters.graph.ops.table import is_fed
-from converters.policy.brains import depends_on_input, fed_through
-from converters.policy.facts import SourceFacts
-from converters.policy.inputs import placeholder_rank
-from converters.policy.memories import looks_like_state, stem_of
-from signatures.roles import Role
+from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.graph.nodes import Graph, node_of, normal_ref
+from export_model.converters.graph.ops.table import is_fed
+from export_model.converters.policy.brains import depends_on_input, fed_through
+from export_model.converters.policy.facts import SourceFacts
+from export_model.converters.policy.inputs import placeholder_rank
+from export_model.converters.policy.memories import looks_like_state, stem_of
+from export_model.signatures.roles import Role
 
 _MATRIX = 2
 

@@ -6,12 +6,12 @@ a Softmax or LogSoftmax is over rows of a matrix, as far as the shapes are known
 
 from __future__ import annotations
 
-from converters.graph.builder import Builder
-from converters.graph.nn.linear import matmul
-from converters.graph.nn.reduction import over_last_axis
-from converters.graph.nodes import Graph, NameScope, Node
-from converters.graph.ops.table import traits
-from converters.graph.shapes import Types, infer_types
+from export_model.converters.graph.builder import Builder
+from export_model.converters.graph.nn.linear import matmul
+from export_model.converters.graph.nn.reduction import over_last_axis
+from export_model.converters.graph.nodes import Graph, NameScope, Node
+from export_model.converters.graph.ops.table import traits
+from export_model.converters.graph.shapes import Types, infer_types
 
 _SIDES = ("adj_x", "adj_y")
 _MATRIX = 2

@@ -8,26 +8,26 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from converters.compiler.compilation import Compilation
-from converters.compiler.passes.inputs import batch_size_rank, constant_value
-from converters.compiler.passes.noise import tensor_of
-from converters.compiler.passes.outputs import LOG_PROBS
-from converters.graph.nodes import Graph, Node, node_of, split_ref
-from converters.graph.shapes import Types, infer_types
-from converters.graph.types import static_shape
-from converters.interfaces.fit import fit_interface, name_numbers
-from converters.policy.action import ActionMeaning, action_meaning
-from converters.policy.brains import Head
-from converters.policy.facts import SourceFacts
-from converters.policy.generations import generation
-from converters.policy.identifiers import id_distribution
-from converters.policy.memories import memory_layout
-from converters.policy.observations import highest_colour, normaliser
-from signatures.errors import SignatureError
-from signatures.interface import Interface
-from signatures.labels import remaining
-from signatures.roles import ACTION_NAMES, OBSERVATIONS, Role, canonical_name, numbers
-from signatures.spec import Memory, PolicySignature, SourceMap, TensorSpec, sources
+from export_model.converters.compiler.compilation import Compilation
+from export_model.converters.compiler.passes.inputs import batch_size_rank, constant_value
+from export_model.converters.compiler.passes.noise import tensor_of
+from export_model.converters.compiler.passes.outputs import LOG_PROBS
+from export_model.converters.graph.nodes import Graph, Node, node_of, split_ref
+from export_model.converters.graph.shapes import Types, infer_types
+from export_model.converters.graph.types import static_shape
+from export_model.converters.interfaces.fit import fit_interface, name_numbers
+from export_model.converters.policy.action import ActionMeaning, action_meaning
+from export_model.converters.policy.brains import Head
+from export_model.converters.policy.facts import SourceFacts
+from export_model.converters.policy.generations import generation
+from export_model.converters.policy.identifiers import id_distribution
+from export_model.converters.policy.memories import memory_layout
+from export_model.converters.policy.observations import highest_colour, normaliser
+from export_model.signatures.errors import SignatureError
+from export_model.signatures.interface import Interface
+from export_model.signatures.labels import remaining
+from export_model.signatures.roles import ACTION_NAMES, OBSERVATIONS, Role, canonical_name, numbers
+from export_model.signatures.spec import Memory, PolicySignature, SourceMap, TensorSpec, sources
 
 _INPUT_ORDER = (*OBSERVATIONS, Role.MASKS, Role.PREV_ACTION, Role.MEMORY_IN, Role.NOISE, Role.PARAMETER)
 _OUTPUT_ORDER = (

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from converters.graph.editor import Editor
-from converters.graph.nodes import Graph, Node
-from converters.graph.ops.slicing import strided_steps
-from converters.graph.ops.table import op_of, traits
-from converters.graph.shapes import Types, infer_types
-from converters.graph.types import INT32, Dim
+from export_model.converters.graph.editor import Editor
+from export_model.converters.graph.nodes import Graph, Node
+from export_model.converters.graph.ops.slicing import strided_steps
+from export_model.converters.graph.ops.table import op_of, traits
+from export_model.converters.graph.shapes import Types, infer_types
+from export_model.converters.graph.types import INT32, Dim
 
 
 def drop_identities(graph: Graph, fetches: Mapping[str, str]) -> tuple[Graph, dict[str, str]]:

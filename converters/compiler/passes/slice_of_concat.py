@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from converters.graph.editor import Editor
-from converters.graph.nodes import Graph, Node, node_of
-from converters.graph.ops.slicing import strided_steps
-from converters.graph.shapes import Types, infer_types
+from export_model.converters.graph.editor import Editor
+from export_model.converters.graph.nodes import Graph, Node, node_of
+from export_model.converters.graph.ops.slicing import strided_steps
+from export_model.converters.graph.shapes import Types, infer_types
 
 _WHOLE = (("slice", None, None, 1), ("slice", 0, None, 1))
 

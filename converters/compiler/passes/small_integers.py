@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from msgspec.structs import replace
 
-from converters.graph.nodes import Graph, NameScope, Node, node_of
-from converters.graph.types import INT32
-from converters.policy.facts import SourceFacts
-from converters.policy.inputs import is_board, placeholder_rank
+from export_model.converters.graph.nodes import Graph, NameScope, Node, node_of
+from export_model.converters.graph.types import INT32
+from export_model.converters.policy.facts import SourceFacts
+from export_model.converters.policy.inputs import is_board, placeholder_rank
 
 _SMALL = tuple(map(np.dtype, (np.int8, np.uint8, np.int16, np.uint16)))
 _OF_IMAGES = 4

@@ -13,10 +13,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from converters.graph.editor import Editor
-from converters.graph.nodes import Graph, Node, split_ref
-from converters.graph.ops.table import op_of
-from converters.graph.shapes import Types, infer_types
+from export_model.converters.graph.editor import Editor
+from export_model.converters.graph.nodes import Graph, Node, split_ref
+from export_model.converters.graph.ops.table import op_of
+from export_model.converters.graph.shapes import Types, infer_types
 
 #: (a tensor, the order in which its axes are read)
 _Turned = tuple[str, tuple[int, ...]]

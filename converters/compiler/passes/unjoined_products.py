@@ -16,10 +16,10 @@ from collections.abc import Collection, Mapping
 
 import numpy as np
 
-from converters.graph.editor import Editor
-from converters.graph.nodes import Graph, Node
-from converters.graph.ops.table import op_of, traits
-from converters.graph.shapes import Types, infer_types
+from export_model.converters.graph.editor import Editor
+from export_model.converters.graph.nodes import Graph, Node
+from export_model.converters.graph.ops.table import op_of, traits
+from export_model.converters.graph.shapes import Types, infer_types
 
 Readers = Mapping[str, list[Node]]
 

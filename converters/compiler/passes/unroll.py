@@ -19,12 +19,12 @@ import numpy as np
 from msgspec import Struct, field
 from msgspec.structs import replace
 
-from converters.graph.editor import Editor
-from converters.graph.nodes import Graph, Node, ref, split_ref
-from converters.graph.ops.table import CONTROL_FLOW, unsupported_error
-from converters.graph.shapes import Types, infer_types
-from converters.graph.types import INT32
-from signatures.errors import GraphError, NotAPolicyError, UnsupportedOpError
+from export_model.converters.graph.editor import Editor
+from export_model.converters.graph.nodes import Graph, Node, ref, split_ref
+from export_model.converters.graph.ops.table import CONTROL_FLOW, unsupported_error
+from export_model.converters.graph.shapes import Types, infer_types
+from export_model.converters.graph.types import INT32
+from export_model.signatures.errors import GraphError, NotAPolicyError, UnsupportedOpError
 
 MAX_TURNS = 64
 #: Of a policy, before its loops are unrolled and after.

@@ -14,12 +14,12 @@ from collections.abc import Mapping, Sequence
 
 from msgspec.structs import replace
 
-from converters.compiler.passes.fold import fold
-from converters.compiler.passes.normalise import normalise
-from converters.graph.nodes import Graph, Node, TensorShape, ref
-from converters.graph.ops.batching_rules import Rows, rule_of
-from converters.graph.ops.table import op_of
-from converters.graph.types import BATCH, TensorType
+from export_model.converters.compiler.passes.fold import fold
+from export_model.converters.compiler.passes.normalise import normalise
+from export_model.converters.graph.nodes import Graph, Node, TensorShape, ref
+from export_model.converters.graph.ops.batching_rules import Rows, rule_of
+from export_model.converters.graph.ops.table import op_of
+from export_model.converters.graph.types import BATCH, TensorType
 
 
 def for_every_row(

@@ -10,13 +10,13 @@ from functools import partial
 
 import numpy as np
 
-from converters.compiler.passes.normalise import normalise
-from converters.graph.nodes import Graph, Node, TensorShape, ref
-from converters.graph.ops.table import op_of
-from converters.graph.shapes import infer_types, numbers_made, run_kernel
-from converters.graph.size_limits import MAX_COMPUTED
-from converters.graph.types import TensorType
-from signatures.errors import SignatureError
+from export_model.converters.compiler.passes.normalise import normalise
+from export_model.converters.graph.nodes import Graph, Node, TensorShape, ref
+from export_model.converters.graph.ops.table import op_of
+from export_model.converters.graph.shapes import infer_types, numbers_made, run_kernel
+from export_model.converters.graph.size_limits import MAX_COMPUTED
+from export_model.converters.graph.types import TensorType
+from export_model.signatures.errors import SignatureError
 
 ROWS = 3
 

@@ -15,10 +15,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from converters.graph.editor import Editor
-from converters.graph.nodes import Graph, Node
-from converters.graph.ops.table import traits
-from converters.graph.types import FLOAT32
+from export_model.converters.graph.editor import Editor
+from export_model.converters.graph.nodes import Graph, Node
+from export_model.converters.graph.ops.table import traits
+from export_model.converters.graph.types import FLOAT32
 
 #: How weights are kept.
 Storage = Literal["float32", "float16", "int8"]

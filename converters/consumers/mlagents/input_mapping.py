@@ -14,11 +14,11 @@ from typing import NoReturn
 import numpy as np
 from msgspec.structs import replace
 
-from converters.consumers.mlagents.names import MASKS, PREVIOUS
-from converters.consumers.mlagents.naming import Dressing
-from converters.graph.types import BATCH, FLOAT32, INT32
-from signatures.roles import SENSOR_ORDER, Role
-from signatures.spec import TensorSpec
+from export_model.converters.consumers.mlagents.names import MASKS, PREVIOUS
+from export_model.converters.consumers.mlagents.naming import Dressing
+from export_model.converters.graph.types import BATCH, FLOAT32, INT32
+from export_model.signatures.roles import SENSOR_ORDER, Role
+from export_model.signatures.spec import TensorSpec
 
 _OBS = re.compile(r"(?:.*/)?obs_(\d+)(?::0)?")
 

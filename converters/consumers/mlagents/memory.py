@@ -13,12 +13,12 @@ from collections.abc import Callable
 from msgspec import Struct
 from msgspec.structs import replace
 
-from converters.consumers.mlagents import input_mapping as feeding
-from converters.consumers.mlagents.names import ACTION, CONTINUOUS, DISCRETE, RECURRENT_IN, RECURRENT_OUT
-from converters.consumers.mlagents.naming import Dressing, row
-from converters.graph.types import FLOAT32
-from signatures.roles import Role
-from signatures.spec import Memory, TensorSpec
+from export_model.converters.consumers.mlagents import input_mapping as feeding
+from export_model.converters.consumers.mlagents.names import ACTION, CONTINUOUS, DISCRETE, RECURRENT_IN, RECURRENT_OUT
+from export_model.converters.consumers.mlagents.naming import Dressing, row
+from export_model.converters.graph.types import FLOAT32
+from export_model.signatures.roles import Role
+from export_model.signatures.spec import Memory, TensorSpec
 
 #: Of a file with both actions, whose memory can carry one: in a note, in ``inspect --unity`` and in ``snippets``.
 DRAWN_KEPT = (

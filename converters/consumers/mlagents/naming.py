@@ -14,19 +14,19 @@ import numpy as np
 from msgspec import Struct, field
 from msgspec.structs import replace
 
-from converters.compiler.passes.fold import fold
-from converters.compiler.passes.naming import name_tensors
-from converters.compiler.passes.signature import LIFTED
-from converters.compiler.passes.simplify import collapse_views, drop_identities
-from converters.compiler.passes.transposes import cancel_transposes
-from converters.consumers.profile import raise_profile_error
-from converters.graph.builder import Builder
-from converters.graph.nodes import Graph, NameScope, Node, ref, split_ref
-from converters.graph.types import FLOAT32, static_shape
-from converters.policy.policy import Policy
-from signatures.interface import Interface
-from signatures.roles import Role
-from signatures.spec import Memory, SourceMap, TensorSpec
+from export_model.converters.compiler.passes.fold import fold
+from export_model.converters.compiler.passes.naming import name_tensors
+from export_model.converters.compiler.passes.signature import LIFTED
+from export_model.converters.compiler.passes.simplify import collapse_views, drop_identities
+from export_model.converters.compiler.passes.transposes import cancel_transposes
+from export_model.converters.consumers.profile import raise_profile_error
+from export_model.converters.graph.builder import Builder
+from export_model.converters.graph.nodes import Graph, NameScope, Node, ref, split_ref
+from export_model.converters.graph.types import FLOAT32, static_shape
+from export_model.converters.policy.policy import Policy
+from export_model.signatures.interface import Interface
+from export_model.signatures.roles import Role
+from export_model.signatures.spec import Memory, SourceMap, TensorSpec
 
 
 class Dressing(Struct, dict=True):

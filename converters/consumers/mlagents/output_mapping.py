@@ -7,12 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 from msgspec import Struct
 
-from converters.consumers.mlagents.input_mapping import supply_masks
-from converters.consumers.mlagents.naming import Dressing, row
-from converters.graph.types import FLOAT32, INT64
-from converters.policy.action import action_meaning
-from signatures.roles import ACTION_NAMES, Role
-from signatures.spec import TensorSpec
+from export_model.converters.consumers.mlagents.input_mapping import supply_masks
+from export_model.converters.consumers.mlagents.naming import Dressing, row
+from export_model.converters.graph.types import FLOAT32, INT64
+from export_model.converters.policy.action import action_meaning
+from export_model.signatures.roles import ACTION_NAMES, Role
+from export_model.signatures.spec import TensorSpec
 
 _DISCRETE = (Role.SAMPLED, Role.LOG_PROBS, Role.PROBS, Role.DETERMINISTIC)
 

@@ -11,18 +11,26 @@ from pathlib import Path
 
 import numpy as np
 
-from converters.compiler.passes.noise import samplers
-from converters.compiler.passes.normalise import normalise
-from converters.consumers.mlagents.names import DISCRETE, EPSILON, MASKS, PREVIOUS, RECURRENT_IN, RECURRENT_OUT, VECTOR
-from converters.consumers.mlagents.version2 import companions, observations
-from converters.formats.barracuda.format import parse
-from converters.formats.barracuda.graph import to_graph
-from converters.formats.barracuda.writer import contract_of
-from converters.formats.format import Kernels
-from converters.graph.jitter import Jitter
-from converters.graph.run import run_graph
-from signatures.roles import ACTION_NAMES, Role
-from signatures.spec import PolicySignature, TensorSpec
+from export_model.converters.compiler.passes.noise import samplers
+from export_model.converters.compiler.passes.normalise import normalise
+from export_model.converters.consumers.mlagents.names import (
+    DISCRETE,
+    EPSILON,
+    MASKS,
+    PREVIOUS,
+    RECURRENT_IN,
+    RECURRENT_OUT,
+    VECTOR,
+)
+from export_model.converters.consumers.mlagents.version2 import companions, observations
+from export_model.converters.formats.barracuda.format import parse
+from export_model.converters.formats.barracuda.graph import to_graph
+from export_model.converters.formats.barracuda.writer import contract_of
+from export_model.converters.formats.format import Kernels
+from export_model.converters.graph.jitter import Jitter
+from export_model.converters.graph.run import run_graph
+from export_model.signatures.roles import ACTION_NAMES, Role
+from export_model.signatures.spec import PolicySignature, TensorSpec
 
 Array = np.ndarray
 Arrays = Mapping[str, Array]

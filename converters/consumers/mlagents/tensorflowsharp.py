@@ -13,11 +13,11 @@ from __future__ import annotations
 import numpy as np
 from msgspec import Struct
 
-from converters.consumers.mlagents import input_mapping as feeding
-from converters.consumers.mlagents.memory import action_columns, give_memory, previous_action, take_memory
-from converters.consumers.mlagents.names import ACTION, EPSILON, PREVIOUS, SEQUENCE, VECTOR, VISUAL
-from converters.consumers.mlagents.naming import Dressing
-from converters.consumers.mlagents.output_mapping import (
+from export_model.converters.consumers.mlagents import input_mapping as feeding
+from export_model.converters.consumers.mlagents.memory import action_columns, give_memory, previous_action, take_memory
+from export_model.converters.consumers.mlagents.names import ACTION, EPSILON, PREVIOUS, SEQUENCE, VECTOR, VISUAL
+from export_model.converters.consumers.mlagents.naming import Dressing
+from export_model.converters.consumers.mlagents.output_mapping import (
     Heads,
     branches,
     continuous_rows,
@@ -25,11 +25,11 @@ from converters.consumers.mlagents.output_mapping import (
     log_probabilities,
     samples,
 )
-from converters.graph.nodes import Node, TensorShape
-from converters.graph.types import BATCH, FLOAT32, INT32
-from converters.policy.policy import Policy
-from signatures.roles import ACTION_SHAPE, IS_CONTINUOUS, MEMORY_SIZE, VERSION_NUMBER, Role
-from signatures.spec import TensorSpec
+from export_model.converters.graph.nodes import Node, TensorShape
+from export_model.converters.graph.types import BATCH, FLOAT32, INT32
+from export_model.converters.policy.policy import Policy
+from export_model.signatures.roles import ACTION_SHAPE, IS_CONTINUOUS, MEMORY_SIZE, VERSION_NUMBER, Role
+from export_model.signatures.spec import TensorSpec
 
 
 class Generation(Struct, frozen=True):

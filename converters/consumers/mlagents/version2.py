@@ -16,10 +16,10 @@ from collections.abc import Iterator
 import numpy as np
 from msgspec.structs import replace
 
-from converters.compiler.passes.broadcast_constants import broadcast_rows
-from converters.consumers.mlagents import input_mapping as feeding
-from converters.consumers.mlagents.memory import give_parts, take_parts
-from converters.consumers.mlagents.names import (
+from export_model.converters.compiler.passes.broadcast_constants import broadcast_rows
+from export_model.converters.consumers.mlagents import input_mapping as feeding
+from export_model.converters.consumers.mlagents.memory import give_parts, take_parts
+from export_model.converters.consumers.mlagents.names import (
     ACTION,
     ACTION_PROBS,
     CONTINUOUS,
@@ -29,10 +29,16 @@ from converters.consumers.mlagents.names import (
     VECTOR,
     VISUAL,
 )
-from converters.consumers.mlagents.naming import Dressing
-from converters.consumers.mlagents.output_mapping import Heads, branches, continuous_rows, heads, log_probabilities
-from converters.policy.policy import Policy
-from signatures.roles import (
+from export_model.converters.consumers.mlagents.naming import Dressing
+from export_model.converters.consumers.mlagents.output_mapping import (
+    Heads,
+    branches,
+    continuous_rows,
+    heads,
+    log_probabilities,
+)
+from export_model.converters.policy.policy import Policy
+from export_model.signatures.roles import (
     ACTION_NAMES,
     ACTION_SHAPE,
     CONTINUOUS_SHAPE,
@@ -42,7 +48,7 @@ from signatures.roles import (
     VERSION_NUMBER,
     Role,
 )
-from signatures.spec import PolicySignature, TensorSpec
+from export_model.signatures.spec import PolicySignature, TensorSpec
 
 _VERSION = 2
 #: What is taken from the scores of a forbidden action in a ``.nn``: e to the power of it is 0, and a half can hold it.

@@ -11,13 +11,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from converters.consumers.mlagents import input_mapping as feeding
-from converters.consumers.mlagents.memory import DRAWN_KEPT, give_memory, is_deterministic, previous_action, take_memory
-from converters.consumers.mlagents.names import CONTINUOUS, DETERMINISTIC, DISCRETE
-from converters.consumers.mlagents.naming import Dressing
-from converters.consumers.mlagents.output_mapping import branches, continuous_rows, heads, samples
-from converters.policy.policy import Policy
-from signatures.roles import CONTINUOUS_SHAPE, DISCRETE_SHAPE, MEMORY_SIZE, VERSION_NUMBER, Role
+from export_model.converters.consumers.mlagents import input_mapping as feeding
+from export_model.converters.consumers.mlagents.memory import (
+    DRAWN_KEPT,
+    give_memory,
+    is_deterministic,
+    previous_action,
+    take_memory,
+)
+from export_model.converters.consumers.mlagents.names import CONTINUOUS, DETERMINISTIC, DISCRETE
+from export_model.converters.consumers.mlagents.naming import Dressing
+from export_model.converters.consumers.mlagents.output_mapping import branches, continuous_rows, heads, samples
+from export_model.converters.policy.policy import Policy
+from export_model.signatures.roles import CONTINUOUS_SHAPE, DISCRETE_SHAPE, MEMORY_SIZE, VERSION_NUMBER, Role
 
 _VERSION = 3
 

@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from msgspec import Struct
 
-from converters.consumers.robots.interface import Interface
-from signatures.errors import ProfileError
+from export_model.converters.consumers.robots.interface import Interface
+from export_model.signatures.errors import ProfileError
 
 _RNN = "leggedrobotics/rsl_rl@14d428d7 rsl_rl/models/rnn_model.py"
 _EXPORTER = "isaac-sim/IsaacLab@046b71b8 source/isaaclab_rl/isaaclab_rl/rsl_rl/exporter.py"
@@ -136,8 +136,8 @@ LOADERS: Mapping[str, Loader] = {
 
 def loadable(profile: str, names: Sequence[str], model: bytes, policy: str) -> None:
     """Raise ProfileError where one of the loaders ``names`` would not load a ``model`` made for ``profile``."""
-    from converters.consumers.robots.interface import interface_of
-    from converters.formats.onnx.proto import decode_model
+    from export_model.converters.consumers.robots.interface import interface_of
+    from export_model.converters.formats.onnx.proto import decode_model
 
     file = interface_of(decode_model(model))
     for loader in (LOADERS[name] for name in names):

@@ -10,14 +10,19 @@ from itertools import pairwise
 import numpy as np
 from msgspec.structs import replace
 
-from converters.consumers.mlagents import input_mapping as feeding
-from converters.consumers.mlagents.naming import Dressing, row
-from converters.consumers.mlagents.output_mapping import branches, continuous_rows, heads, log_probabilities
-from converters.consumers.robots.loaders import ACTIONS, CELL, HIDDEN, OBS, OUTPUT, STATE
-from converters.graph.types import BATCH
-from converters.policy.policy import Policy
-from signatures.roles import Role
-from signatures.spec import Memory, TensorSpec
+from export_model.converters.consumers.mlagents import input_mapping as feeding
+from export_model.converters.consumers.mlagents.naming import Dressing, row
+from export_model.converters.consumers.mlagents.output_mapping import (
+    branches,
+    continuous_rows,
+    heads,
+    log_probabilities,
+)
+from export_model.converters.consumers.robots.loaders import ACTIONS, CELL, HIDDEN, OBS, OUTPUT, STATE
+from export_model.converters.graph.types import BATCH
+from export_model.converters.policy.policy import Policy
+from export_model.signatures.roles import Role
+from export_model.signatures.spec import Memory, TensorSpec
 
 ISAAC_LAB, GODOT_RL = "isaac-lab", "godot-rl"
 _PARTS = {"h": HIDDEN, "c": CELL}

@@ -6,13 +6,13 @@ import contextlib
 import re
 from collections.abc import Sequence
 
-from converters.consumers.mlagents.names import EPSILON, MASKS, PREVIOUS, RECURRENT_IN, SEQUENCE, VECTOR
-from converters.consumers.unity.findings import UnityThrows
-from converters.consumers.unity.model import FIRST_VERSION, CheckedModel, InputView, truncate
-from converters.consumers.unity.onnx_file import OnnxFile
-from converters.consumers.unity.settings import Brain, sensors_of
-from converters.formats.barracuda.format import NnModel, four_axes
-from signatures.roles import DISCRETE_SHAPE, VERSION_NUMBER
+from export_model.converters.consumers.mlagents.names import EPSILON, MASKS, PREVIOUS, RECURRENT_IN, SEQUENCE, VECTOR
+from export_model.converters.consumers.unity.findings import UnityThrows
+from export_model.converters.consumers.unity.model import FIRST_VERSION, CheckedModel, InputView, truncate
+from export_model.converters.consumers.unity.onnx_file import OnnxFile
+from export_model.converters.consumers.unity.settings import Brain, sensors_of
+from export_model.converters.formats.barracuda.format import NnModel, four_axes
+from export_model.signatures.roles import DISCRETE_SHAPE, VERSION_NUMBER
 
 _NOT_SENSED = frozenset({MASKS, PREVIOUS, EPSILON, SEQUENCE, RECURRENT_IN})
 #: Cameras have up to so many channels.

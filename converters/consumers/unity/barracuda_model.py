@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 from msgspec import Struct, field
 
-from converters.consumers.mlagents.names import ACTION, CONTINUOUS, DISCRETE
-from converters.consumers.unity.channel_order import keeps_last
-from converters.consumers.unity.consumers import Consumer
-from converters.consumers.unity.findings import Thrown, UnityThrows, null_reference
-from converters.consumers.unity.model import CheckedModel, InputView, truncate
-from converters.consumers.unity.onnx_file import Dims, OnnxFile, attributes
-from converters.formats.barracuda.format import NnModel, four_axes
-from signatures.roles import DISCRETE_SHAPE, MEMORY_SIZE, VERSION_NUMBER
+from export_model.converters.consumers.mlagents.names import ACTION, CONTINUOUS, DISCRETE
+from export_model.converters.consumers.unity.channel_order import keeps_last
+from export_model.converters.consumers.unity.consumers import Consumer
+from export_model.converters.consumers.unity.findings import Thrown, UnityThrows, null_reference
+from export_model.converters.consumers.unity.model import CheckedModel, InputView, truncate
+from export_model.converters.consumers.unity.onnx_file import Dims, OnnxFile, attributes
+from export_model.converters.formats.barracuda.format import NnModel, four_axes
+from export_model.signatures.roles import DISCRETE_SHAPE, MEMORY_SIZE, VERSION_NUMBER
 
 _TO_NCHW = (0, 3, 1, 2)
 _INITIAL_H = 5

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from enum import Enum
 from typing import Any
 
-from converters.consumers.unity.onnx_file import OnnxFile, attributes
+from export_model.converters.consumers.unity.onnx_file import OnnxFile, attributes
 
 _TO_LAST, _TO_FIRST = (0, 2, 3, 1), (0, 3, 1, 2)
 #: Operators that take channels first alone.

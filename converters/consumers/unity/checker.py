@@ -9,23 +9,23 @@ from typing import Any, TypeVar
 from msgspec import Struct, field
 from msgspec.structs import replace
 
-from converters.consumers.unity import barracuda_model, importing, rules, sentis_model
-from converters.consumers.unity.assumed import assumed_brain, nn_ranks, onnx_ranks
-from converters.consumers.unity.constructs import INPUT, OUTPUT, constructs
-from converters.consumers.unity.consumers import CONSUMERS, Consumer, Engine
-from converters.consumers.unity.findings import Finding, Severity, Thrown, UnityThrows
-from converters.consumers.unity.model import CheckedModel
-from converters.consumers.unity.onnx_file import OnnxFile, read_onnx_file
-from converters.consumers.unity.players import PLAYERS, Outcome
-from converters.consumers.unity.playing import Played, play, throws
-from converters.consumers.unity.readings import Reading, misreadings
-from converters.consumers.unity.scene import Scene
-from converters.consumers.unity.settings import Brain
-from converters.files.fetch import Fetched, read_bytes
-from converters.formats.barracuda import format as nn_format
-from converters.formats.recognise import recognise_path
-from converters.formats.registry import BARRACUDA, ONNX
-from signatures.errors import ExportModelError, SourceError
+from export_model.converters.consumers.unity import barracuda_model, importing, rules, sentis_model
+from export_model.converters.consumers.unity.assumed import assumed_brain, nn_ranks, onnx_ranks
+from export_model.converters.consumers.unity.constructs import INPUT, OUTPUT, constructs
+from export_model.converters.consumers.unity.consumers import CONSUMERS, Consumer, Engine
+from export_model.converters.consumers.unity.findings import Finding, Severity, Thrown, UnityThrows
+from export_model.converters.consumers.unity.model import CheckedModel
+from export_model.converters.consumers.unity.onnx_file import OnnxFile, read_onnx_file
+from export_model.converters.consumers.unity.players import PLAYERS, Outcome
+from export_model.converters.consumers.unity.playing import Played, play, throws
+from export_model.converters.consumers.unity.readings import Reading, misreadings
+from export_model.converters.consumers.unity.scene import Scene
+from export_model.converters.consumers.unity.settings import Brain
+from export_model.converters.files.fetch import Fetched, read_bytes
+from export_model.converters.formats.barracuda import format as nn_format
+from export_model.converters.formats.recognise import recognise_path
+from export_model.converters.formats.registry import BARRACUDA, ONNX
+from export_model.signatures.errors import ExportModelError, SourceError
 
 #: Deterministic Inference of Behavior Parameters: off and on.
 MODES = {"stochastic": False, "deterministic": True}

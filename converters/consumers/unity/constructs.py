@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from msgspec import Struct
 
-from signatures.errors import DamagedFileError
+from export_model.signatures.errors import DamagedFileError
 
 #: The pseudo-operators that an output and an input of the model are listed as.
 OUTPUT, INPUT = "(output)", "(input)"

@@ -13,8 +13,8 @@ from enum import Enum
 
 from msgspec import Struct
 
-from converters.formats.registry import BARRACUDA, ONNX
-from signatures.errors import UsageError
+from export_model.converters.formats.registry import BARRACUDA, ONNX
+from export_model.signatures.errors import UsageError
 
 
 class Engine(Enum):

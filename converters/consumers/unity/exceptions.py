@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from converters.consumers.unity.importers import IMPORTERS
+from export_model.converters.consumers.unity.importers import IMPORTERS
 
 
 def _parsing(layer: str, op: str, cause: str) -> str:

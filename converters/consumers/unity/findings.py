@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import StrEnum
 
-from signatures.fields import Record
+from export_model.signatures.fields import Record
 
 
 class Severity(StrEnum):

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from converters.consumers.mlagents.names import ACTION, CONTINUOUS
-from converters.consumers.unity.layout import reads_flat
-from converters.consumers.unity.scene import Port, Scene
-from signatures.roles import MEMORY_SIZE
+from export_model.converters.consumers.mlagents.names import ACTION, CONTINUOUS
+from export_model.converters.consumers.unity.layout import reads_flat
+from export_model.converters.consumers.unity.scene import Port, Scene
+from export_model.signatures.roles import MEMORY_SIZE
 
 
 def sensor_size(port: Port) -> int:

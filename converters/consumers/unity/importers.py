@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from converters.consumers.unity.consumers import CONSUMERS
+from export_model.converters.consumers.unity.consumers import CONSUMERS
 
 #: The importers that were measured, the oldest first, and what of ML-Agents uses them.
 IMPORTERS: Mapping[str, str] = {

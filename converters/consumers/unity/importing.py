@@ -9,12 +9,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from converters.consumers.mlagents.names import RECURRENT_IN
-from converters.consumers.unity.constructs import MOST_AXES
-from converters.consumers.unity.consumers import Consumer, Engine
-from converters.consumers.unity.findings import Thrown, null_reference
-from converters.consumers.unity.onnx_file import OnnxFile, attributes
-from converters.consumers.unity.readings import ELEMENTWISE
+from export_model.converters.consumers.mlagents.names import RECURRENT_IN
+from export_model.converters.consumers.unity.constructs import MOST_AXES
+from export_model.converters.consumers.unity.consumers import Consumer, Engine
+from export_model.converters.consumers.unity.findings import Thrown, null_reference
+from export_model.converters.consumers.unity.onnx_file import OnnxFile, attributes
+from export_model.converters.consumers.unity.readings import ELEMENTWISE
 
 #: The operators of Barracuda 3.0.0 (its manual, and the constructs that were run).
 _BARRACUDA = """

@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterator
 
 from msgspec import Struct
 
-from converters.consumers.unity.players import Outcome
-from converters.formats.barracuda.assemble import FLATTENS_ITSELF
-from converters.formats.barracuda.format import Layer, NnModel
-from converters.graph.ops.barracuda.vocabulary import Activation, LayerType
+from export_model.converters.consumers.unity.players import Outcome
+from export_model.converters.formats.barracuda.assemble import FLATTENS_ITSELF
+from export_model.converters.formats.barracuda.format import Layer, NnModel
+from export_model.converters.graph.ops.barracuda.vocabulary import Activation, LayerType
 
 #: Activations that go by the channels.
 _BY_CHANNELS = frozenset({Activation.SOFTMAX, Activation.LOG_SOFTMAX})

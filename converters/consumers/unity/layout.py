@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from converters.consumers.unity.onnx_file import OnnxFile, attributes
-from converters.formats.barracuda.format import NnModel
-from converters.graph.ops.barracuda.vocabulary import LayerType
+from export_model.converters.consumers.unity.onnx_file import OnnxFile, attributes
+from export_model.converters.formats.barracuda.format import NnModel
+from export_model.converters.graph.ops.barracuda.vocabulary import LayerType
 
 _SWAPPED = (0, 2, 1)
 _VIEWS = frozenset({"Reshape", "Flatten"})

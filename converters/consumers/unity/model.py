@@ -8,8 +8,8 @@ from typing import ClassVar
 import numpy as np
 from msgspec import Struct
 
-from converters.consumers.mlagents.names import ACTION, CONTINUOUS, DETERMINISTIC, DISCRETE, RECURRENT_OUT
-from signatures.roles import (
+from export_model.converters.consumers.mlagents.names import ACTION, CONTINUOUS, DETERMINISTIC, DISCRETE, RECURRENT_OUT
+from export_model.signatures.roles import (
     ACTION_SHAPE,
     CONTINUOUS_SHAPE,
     DISCRETE_SHAPE,

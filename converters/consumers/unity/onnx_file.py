@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 from msgspec import Struct, field
 
-from converters.files.fetch import read_bytes
-from converters.formats.onnx.messages import as_onnx_message
-from converters.formats.onnx.proto import array_of, decode_model, load_external
-from signatures.errors import DamagedFileError, ExportModelError
+from export_model.converters.files.fetch import read_bytes
+from export_model.converters.formats.onnx.messages import as_onnx_message
+from export_model.converters.formats.onnx.proto import array_of, decode_model, load_external
+from export_model.signatures.errors import DamagedFileError, ExportModelError
 
 #: TensorProto.DataType that Sentis holds as floats; everything else is held as int.
 _FLOATS = frozenset({1, 10, 11, 16})

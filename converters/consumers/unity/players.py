@@ -13,7 +13,7 @@ from enum import StrEnum
 
 from msgspec import Struct
 
-from converters.consumers.mlagents.names import (
+from export_model.converters.consumers.mlagents.names import (
     ACTION,
     CONTINUOUS,
     DETERMINISTIC,
@@ -26,10 +26,10 @@ from converters.consumers.mlagents.names import (
     SEQUENCE,
     VALUE,
 )
-from converters.consumers.unity import forms
-from converters.consumers.unity.consumers import CONSUMERS, Engine
-from converters.consumers.unity.scene import Port, Scene
-from signatures.roles import MEMORY_SIZE
+from export_model.converters.consumers.unity import forms
+from export_model.converters.consumers.unity.consumers import CONSUMERS, Engine
+from export_model.converters.consumers.unity.scene import Port, Scene
+from export_model.signatures.roles import MEMORY_SIZE
 
 #: Every observation that one of the agent's sensors is written into; every input but those of one number.
 OBSERVATION, ANY = "(observation)", "(any input)"

@@ -7,15 +7,25 @@ from typing import Any
 
 from msgspec import Struct
 
-from converters.consumers.mlagents.memory import DRAWN_KEPT
-from converters.consumers.mlagents.names import ACTION, CONTINUOUS, DETERMINISTIC, DISCRETE, RECURRENT_OUT
-from converters.consumers.unity.findings import Thrown
-from converters.consumers.unity.forms import fields
-from converters.consumers.unity.layers import trips
-from converters.consumers.unity.onnx_file import OnnxFile
-from converters.consumers.unity.players import ANY, FED, OBSERVATION, ONE_NUMBER, PLAYERS, UNKNOWN, Outcome, Player, Row
-from converters.consumers.unity.rules import culture_key
-from converters.consumers.unity.scene import Port, Scene
+from export_model.converters.consumers.mlagents.memory import DRAWN_KEPT
+from export_model.converters.consumers.mlagents.names import ACTION, CONTINUOUS, DETERMINISTIC, DISCRETE, RECURRENT_OUT
+from export_model.converters.consumers.unity.findings import Thrown
+from export_model.converters.consumers.unity.forms import fields
+from export_model.converters.consumers.unity.layers import trips
+from export_model.converters.consumers.unity.onnx_file import OnnxFile
+from export_model.converters.consumers.unity.players import (
+    ANY,
+    FED,
+    OBSERVATION,
+    ONE_NUMBER,
+    PLAYERS,
+    UNKNOWN,
+    Outcome,
+    Player,
+    Row,
+)
+from export_model.converters.consumers.unity.rules import culture_key
+from export_model.converters.consumers.unity.scene import Port, Scene
 
 #: Operators that compute nothing.
 _MOVES = frozenset({"Cast", "Concat", "Flatten", "Identity", "Reshape", "Slice", "Squeeze", "Unsqueeze"})

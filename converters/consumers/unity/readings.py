@@ -14,8 +14,16 @@ from enum import StrEnum
 import numpy as np
 from msgspec import Struct
 
-from converters.consumers.unity.constructs import INPUT, MOST_AXES, OUTPUT, Construct, Model, Operand, Source
-from converters.consumers.unity.importers import (
+from export_model.converters.consumers.unity.constructs import (
+    INPUT,
+    MOST_AXES,
+    OUTPUT,
+    Construct,
+    Model,
+    Operand,
+    Source,
+)
+from export_model.converters.consumers.unity.importers import (
     BARRACUDA,
     BEFORE_2_3,
     BEFORE_2_4,

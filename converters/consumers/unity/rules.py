@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
-from converters.consumers.mlagents.names import (
+from export_model.converters.consumers.mlagents.names import (
     ACTION,
     CONTINUOUS,
     DETERMINISTIC,
@@ -21,9 +21,9 @@ from converters.consumers.mlagents.names import (
     VECTOR,
     VISUAL,
 )
-from converters.consumers.unity.consumers import Checks, Consumer
-from converters.consumers.unity.findings import Finding, Severity, warning
-from converters.consumers.unity.model import (
+from export_model.converters.consumers.unity.consumers import Checks, Consumer
+from export_model.converters.consumers.unity.findings import Finding, Severity, warning
+from export_model.converters.consumers.unity.model import (
     FIRST_VERSION,
     LAST_VERSION,
     CheckedModel,
@@ -31,8 +31,15 @@ from converters.consumers.unity.model import (
     action_output,
     truncate,
 )
-from converters.consumers.unity.settings import Brain, Sensor
-from signatures.roles import ACTION_SHAPE, CONTINUOUS_SHAPE, DISCRETE_SHAPE, IS_CONTINUOUS, MEMORY_SIZE, VERSION_NUMBER
+from export_model.converters.consumers.unity.settings import Brain, Sensor
+from export_model.signatures.roles import (
+    ACTION_SHAPE,
+    CONTINUOUS_SHAPE,
+    DISCRETE_SHAPE,
+    IS_CONTINUOUS,
+    MEMORY_SIZE,
+    VERSION_NUMBER,
+)
 
 _PACKAGE = "com.unity.ml-agents"
 _ACTION_OUTPUTS = (ACTION, CONTINUOUS, DISCRETE, DETERMINISTIC + CONTINUOUS, DETERMINISTIC + DISCRETE)

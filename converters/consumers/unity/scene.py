@@ -7,13 +7,13 @@ from collections.abc import Iterator, Mapping
 
 from msgspec import Struct
 
-from converters.consumers.mlagents.names import VECTOR, VISUAL
-from converters.consumers.unity.consumers import Consumer
-from converters.consumers.unity.model import FIRST_VERSION, CheckedModel, InputView
-from converters.consumers.unity.onnx_file import Dims, OnnxFile
-from converters.consumers.unity.rules import observation
-from converters.consumers.unity.settings import Brain
-from converters.formats.barracuda.format import NnModel
+from export_model.converters.consumers.mlagents.names import VECTOR, VISUAL
+from export_model.converters.consumers.unity.consumers import Consumer
+from export_model.converters.consumers.unity.model import FIRST_VERSION, CheckedModel, InputView
+from export_model.converters.consumers.unity.onnx_file import Dims, OnnxFile
+from export_model.converters.consumers.unity.rules import observation
+from export_model.converters.consumers.unity.settings import Brain
+from export_model.converters.formats.barracuda.format import NnModel
 
 _INTEGERS = frozenset({2, 3, 4, 5, 6, 7, 9, 12, 13})  # TensorProto.DataType
 

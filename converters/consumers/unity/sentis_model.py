@@ -16,13 +16,20 @@ from typing import Any, ClassVar
 import numpy as np
 from msgspec import Struct, field
 
-from converters.consumers.mlagents.names import CONTINUOUS, DISCRETE
-from converters.consumers.unity.barracuda_model import trim_index
-from converters.consumers.unity.consumers import Consumer
-from converters.consumers.unity.findings import Thrown, UnityThrows, null_reference
-from converters.consumers.unity.model import CheckedModel, InputView, truncate
-from converters.consumers.unity.onnx_file import Dims, OnnxFile, attributes
-from signatures.roles import ACTION_SHAPE, CONTINUOUS_SHAPE, DISCRETE_SHAPE, IS_CONTINUOUS, MEMORY_SIZE, VERSION_NUMBER
+from export_model.converters.consumers.mlagents.names import CONTINUOUS, DISCRETE
+from export_model.converters.consumers.unity.barracuda_model import trim_index
+from export_model.converters.consumers.unity.consumers import Consumer
+from export_model.converters.consumers.unity.findings import Thrown, UnityThrows, null_reference
+from export_model.converters.consumers.unity.model import CheckedModel, InputView, truncate
+from export_model.converters.consumers.unity.onnx_file import Dims, OnnxFile, attributes
+from export_model.signatures.roles import (
+    ACTION_SHAPE,
+    CONTINUOUS_SHAPE,
+    DISCRETE_SHAPE,
+    IS_CONTINUOUS,
+    MEMORY_SIZE,
+    VERSION_NUMBER,
+)
 
 _SINGLE, _INT32 = "Single", "Int32"
 

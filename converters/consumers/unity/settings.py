@@ -10,9 +10,9 @@ from typing import Any
 
 from msgspec import field
 
-from converters.files.fetch import read_bytes
-from signatures.errors import UsageError
-from signatures.fields import Record
+from export_model.converters.files.fetch import read_bytes
+from export_model.signatures.errors import UsageError
+from export_model.signatures.fields import Record
 
 #: Class of a sensor by the number of its axes, where nobody names it.
 _CLASSES = {1: "VectorSensor", 2: "BufferSensor", 3: "CameraSensor"}

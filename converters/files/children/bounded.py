@@ -7,7 +7,7 @@ import subprocess
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from converters.files.children import confinement
+from export_model.converters.files.children import confinement
 
 
 def bounds(folder: Path, memory: int, seconds: int, *, starts: bool) -> Callable[[], None]:

@@ -14,8 +14,8 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, BinaryIO, NoReturn, Protocol
 
-from converters.files.children.frames import Tensors, read_frame, write_frame
-from signatures.cycles import raise_gc_threshold
+from export_model.converters.files.children.frames import Tensors, read_frame, write_frame
+from export_model.signatures.cycles import raise_gc_threshold
 
 
 class Model(Protocol):

@@ -15,8 +15,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from functools import cache
 from pathlib import Path
 
-import converters
-from converters.files.children.confinement import READABLE
+from export_model import converters
+from export_model.converters.files.children.confinement import READABLE
 
 #: Variables that a child is given where they are set, and what reads them.
 _KEPT = frozenset((

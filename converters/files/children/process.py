@@ -19,14 +19,20 @@ from typing import IO, Any, BinaryIO, cast
 
 import numpy as np
 
-from converters.files.children.confinement import in_force
-from converters.files.children.environment import child_environment, readable_places
-from converters.files.children.frames import MAX_TENSOR_BYTES, FramingError, Tensors, read_frame, write_frame
-from converters.files.children.memory_limits import Memory
-from converters.files.children.python import confined_command
-from converters.files.children.time_limits import processor_time, time_limit
-from converters.files.folders import OwnFolder, link_model, live_folders, scratch_folder, size_of
-from signatures.errors import ExportModelError, RuntimeUnavailableError
+from export_model.converters.files.children.confinement import in_force
+from export_model.converters.files.children.environment import child_environment, readable_places
+from export_model.converters.files.children.frames import (
+    MAX_TENSOR_BYTES,
+    FramingError,
+    Tensors,
+    read_frame,
+    write_frame,
+)
+from export_model.converters.files.children.memory_limits import Memory
+from export_model.converters.files.children.python import confined_command
+from export_model.converters.files.children.time_limits import processor_time, time_limit
+from export_model.converters.files.folders import OwnFolder, link_model, live_folders, scratch_folder, size_of
+from export_model.signatures.errors import ExportModelError, RuntimeUnavailableError
 
 #: Seconds that one request may take: importing TensorFlow on a loaded machine is the slowest of them.
 TIMEOUT = 300.0

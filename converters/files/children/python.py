@@ -11,7 +11,7 @@ import threading
 from collections.abc import Sequence
 from pathlib import Path
 
-import converters
+from export_model import converters
 
 #: Modules come from this very copy of the packages, installed or not, and none (-P) from the folder that the user
 #: stands in, where ``-c`` looks first: it may be untrusted.
@@ -35,7 +35,7 @@ def confined_command(command: Sequence[str], scratch: str) -> list[str]:
     parent = os.getpid() if threading.current_thread() is threading.main_thread() else 0
     if tuple(command[:3]) == _PYTHON and command[3].startswith(_PATH):
         # A child of ours gives up by itself, before it does anything else: a program for it costs another 30 ms.
-        first = f"from converters.files.children import confinement; confinement.begin({scratch!r}, {parent}); "
+        first = f"from export_model.converters.files.children import confinement; confinement.begin({scratch!r}, {parent}); "
         return [*_PYTHON, _PATH + first + command[3].removeprefix(_PATH), *command[4:]]
     if shutil.which(command[0]) is None:
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), command[0])

@@ -5,12 +5,12 @@ from __future__ import annotations
 import struct
 from typing import TYPE_CHECKING
 
-from converters.formats.format import Format, defer_imports
+from export_model.converters.formats.format import Format, defer_imports
 
 if TYPE_CHECKING:
-    from converters.files.file_probe import Content
-    from converters.formats.barracuda import source as _source
-    from converters.formats.barracuda import writer as _writer
+    from export_model.converters.files.file_probe import Content
+    from export_model.converters.formats.barracuda import source as _source
+    from export_model.converters.formats.barracuda import writer as _writer
 else:
     _source, _writer = defer_imports(__name__, "source", "writer")
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from converters.formats.barracuda.layer_builder import LayerBuilder, Value
-from converters.graph.builder import Builder
-from converters.graph.nn import activations as nn
-from converters.graph.nn import reduction, trigonometry
-from converters.graph.ops.barracuda.vocabulary import Activation, activation_label
-from converters.graph.ops.table import TABLE
+from export_model.converters.formats.barracuda.layer_builder import LayerBuilder, Value
+from export_model.converters.graph.builder import Builder
+from export_model.converters.graph.nn import activations as nn
+from export_model.converters.graph.nn import reduction, trigonometry
+from export_model.converters.graph.ops.barracuda.vocabulary import Activation, activation_label
+from export_model.converters.graph.ops.table import TABLE
 
 #: Activations that are one op: those that its entry is written as, and those that Barracuda lacks before 1.4 or rounds
 #: another way, which are read alone.

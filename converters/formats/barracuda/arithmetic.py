@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from converters.formats.barracuda.layer_builder import LayerBuilder, Shape, Value, with_length
-from converters.formats.barracuda.shaping import axis_of
-from converters.graph.nn import reduction
-from converters.graph.ops.barracuda.vocabulary import C, LayerType, N
-from converters.graph.ops.table import TABLE
-from converters.graph.types import FLOAT32
+from export_model.converters.formats.barracuda.layer_builder import LayerBuilder, Shape, Value, with_length
+from export_model.converters.formats.barracuda.shaping import axis_of
+from export_model.converters.graph.nn import reduction
+from export_model.converters.graph.ops.barracuda.vocabulary import C, LayerType, N
+from export_model.converters.graph.ops.table import TABLE
+from export_model.converters.graph.types import FLOAT32
 
 _FOLDED: Mapping[LayerType, str] = {
     LayerType.ADD: "Add",

@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from msgspec.structs import replace
 
-from converters.formats.barracuda.format import Dataset, Layer, NnInput, NnMemory, NnModel
-from converters.graph.ops.barracuda.builder import Draft, NnBuilder
-from converters.graph.ops.barracuda.vocabulary import Activation, LayerType
-from signatures.errors import UnsupportedOpError
+from export_model.converters.formats.barracuda.format import Dataset, Layer, NnInput, NnMemory, NnModel
+from export_model.converters.graph.ops.barracuda.builder import Draft, NnBuilder
+from export_model.converters.graph.ops.barracuda.vocabulary import Activation, LayerType
+from export_model.signatures.errors import UnsupportedOpError
 
 #: Every Barracuda from 1.0 to 3.0 reads it, and none of the later ones is read by all.
 VERSION = 16

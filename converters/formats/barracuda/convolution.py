@@ -11,11 +11,11 @@ from collections.abc import Sequence
 import numpy as np
 from msgspec.structs import replace
 
-from converters.formats.barracuda.dense import add_bias
-from converters.formats.barracuda.layer_builder import LayerBuilder, Value
-from converters.graph.nn import convolution as nn
-from converters.graph.nn import normalisation, pooling
-from converters.graph.ops.barracuda.vocabulary import LayerType
+from export_model.converters.formats.barracuda.dense import add_bias
+from export_model.converters.formats.barracuda.layer_builder import LayerBuilder, Value
+from export_model.converters.graph.nn import convolution as nn
+from export_model.converters.graph.nn import normalisation, pooling
+from export_model.converters.graph.ops.barracuda.vocabulary import LayerType
 
 _SAME, _SAME_LOWER = -1, -2
 #: What Unity's maximum starts from; a border of it never wins.

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from converters.formats.barracuda.layer_builder import LayerBuilder, Shape, Value
-from converters.graph.nn import linear
-from converters.graph.nn.activations import scale_and_shift
-from converters.graph.ops.barracuda.vocabulary import LayerType
-from converters.graph.types import FLOAT32, INT32, INT64
+from export_model.converters.formats.barracuda.layer_builder import LayerBuilder, Shape, Value
+from export_model.converters.graph.nn import linear
+from export_model.converters.graph.nn.activations import scale_and_shift
+from export_model.converters.graph.ops.barracuda.vocabulary import LayerType
+from export_model.converters.graph.types import FLOAT32, INT32, INT64
 
 
 def dense(b: LayerBuilder, args: Sequence[Value]) -> Value:

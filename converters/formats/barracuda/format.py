@@ -26,7 +26,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
-from signatures.errors import DamagedFileError
+from export_model.signatures.errors import DamagedFileError
 
 VERSIONS = range(15, 21)
 #: The first version of each change; see the module.

@@ -15,15 +15,22 @@ from functools import partial
 from msgspec import Struct
 from msgspec.structs import replace
 
-from converters.formats.barracuda.format import EIGHT_AXES, Layer, NnInput, NnModel, draws_in_model, four_axes
-from converters.formats.barracuda.layer_builder import MAX_ELEMENTS, LayerBuilder, Value, node_name
-from converters.formats.barracuda.layers import check_bypassed, translate
-from converters.formats.barracuda.slices import upstream
-from converters.graph.nodes import Graph, NameScope, joined_name
-from converters.graph.ops.barracuda.vocabulary import LayerType
-from converters.graph.types import FLOAT32, INT32, INT64
-from signatures.errors import DamagedFileError, ExportModelError, SignatureError
-from signatures.roles import ACTION_NAMES, ACTION_SHAPE, OUTPUT_NAMES, VERSION_NUMBER, Role
+from export_model.converters.formats.barracuda.format import (
+    EIGHT_AXES,
+    Layer,
+    NnInput,
+    NnModel,
+    draws_in_model,
+    four_axes,
+)
+from export_model.converters.formats.barracuda.layer_builder import MAX_ELEMENTS, LayerBuilder, Value, node_name
+from export_model.converters.formats.barracuda.layers import check_bypassed, translate
+from export_model.converters.formats.barracuda.slices import upstream
+from export_model.converters.graph.nodes import Graph, NameScope, joined_name
+from export_model.converters.graph.ops.barracuda.vocabulary import LayerType
+from export_model.converters.graph.types import FLOAT32, INT32, INT64
+from export_model.signatures.errors import DamagedFileError, ExportModelError, SignatureError
+from export_model.signatures.roles import ACTION_NAMES, ACTION_SHAPE, OUTPUT_NAMES, VERSION_NUMBER, Role
 
 MEMORY_IN, MEMORY_OUT = "recurrent_in", "recurrent_out"
 _INTEGER_INPUTS = ("prev_action",)

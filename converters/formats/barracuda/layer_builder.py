@@ -14,11 +14,11 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
-from converters.formats.barracuda.format import Layer, four_axes
-from converters.graph.builder import Builder
-from converters.graph.nodes import NameScope, Node
-from converters.graph.ops.barracuda.vocabulary import layer_label
-from signatures.errors import GraphError, UnsupportedOpError
+from export_model.converters.formats.barracuda.format import Layer, four_axes
+from export_model.converters.graph.builder import Builder
+from export_model.converters.graph.nodes import NameScope, Node
+from export_model.converters.graph.ops.barracuda.vocabulary import layer_label
+from export_model.signatures.errors import GraphError, UnsupportedOpError
 
 #: N, H, W, C; N is None where it is the batch.
 Shape = tuple[int | None, int, int, int]

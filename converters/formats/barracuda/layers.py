@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 
-from converters.formats.barracuda import activations, arithmetic, convolution, dense, shaping
-from converters.formats.barracuda.format import Layer
-from converters.formats.barracuda.layer_builder import LayerBuilder, Value
-from converters.graph.ops.barracuda.vocabulary import Activation, LayerType, layer_label
-from signatures.errors import DamagedFileError, UnsupportedOpError
+from export_model.converters.formats.barracuda import activations, arithmetic, convolution, dense, shaping
+from export_model.converters.formats.barracuda.format import Layer
+from export_model.converters.formats.barracuda.layer_builder import LayerBuilder, Value
+from export_model.converters.graph.ops.barracuda.vocabulary import Activation, LayerType, layer_label
+from export_model.signatures.errors import DamagedFileError, UnsupportedOpError
 
 #: Takes (builder, the layer's inputs and then its datasets).
 Translate = Callable[[LayerBuilder, Sequence[Value]], Value]

@@ -8,20 +8,20 @@ that ML-Agents feeds and reads, from API version 3 on, is [N, 1, M, 1] (``Recurr
 
 from __future__ import annotations
 
-from converters.compiler.targets import BARRACUDA, prepare
-from converters.formats.barracuda.assemble import assemble
-from converters.formats.barracuda.format import NnInput, NnMemory, NnModel, draws_in_model
-from converters.formats.barracuda.lower_graph import lower_graph
-from converters.graph.nodes import Node, node_of
-from converters.graph.ops.barracuda.arrays import as_row
-from converters.graph.ops.barracuda.builder import NnBuilder
-from converters.graph.ops.barracuda.values import FREE, Axes, Value, usual_axes
-from converters.graph.ops.barracuda.vocabulary import C, H, LayerType, N, W
-from converters.graph.shapes import infer_types
-from converters.graph.types import BATCH, Dim
-from converters.policy.policy import Policy
-from signatures.roles import VERSION_NUMBER, Role
-from signatures.spec import PolicySignature, TensorSpec
+from export_model.converters.compiler.targets import BARRACUDA, prepare
+from export_model.converters.formats.barracuda.assemble import assemble
+from export_model.converters.formats.barracuda.format import NnInput, NnMemory, NnModel, draws_in_model
+from export_model.converters.formats.barracuda.lower_graph import lower_graph
+from export_model.converters.graph.nodes import Node, node_of
+from export_model.converters.graph.ops.barracuda.arrays import as_row
+from export_model.converters.graph.ops.barracuda.builder import NnBuilder
+from export_model.converters.graph.ops.barracuda.values import FREE, Axes, Value, usual_axes
+from export_model.converters.graph.ops.barracuda.vocabulary import C, H, LayerType, N, W
+from export_model.converters.graph.shapes import infer_types
+from export_model.converters.graph.types import BATCH, Dim
+from export_model.converters.policy.policy import Policy
+from export_model.signatures.roles import VERSION_NUMBER, Role
+from export_model.signatures.spec import PolicySignature, TensorSpec
 
 _ROW: Axes = (N, C)
 _IMAGE: Axes = (N, H, W, C)

@@ -8,15 +8,15 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
-from converters.graph.nodes import Graph, Node, node_of, normal_ref, reachable, ref
-from converters.graph.ops.barracuda.builder import NnBuilder
-from converters.graph.ops.barracuda.elementwise import swish
-from converters.graph.ops.barracuda.values import Value
-from converters.graph.ops.base import MISFIT, OpDef, misfit
-from converters.graph.ops.table import is_fed, op_of, traits
-from converters.graph.shapes import run_kernel
-from converters.graph.types import BATCH
-from signatures.errors import UnsupportedOpError
+from export_model.converters.graph.nodes import Graph, Node, node_of, normal_ref, reachable, ref
+from export_model.converters.graph.ops.barracuda.builder import NnBuilder
+from export_model.converters.graph.ops.barracuda.elementwise import swish
+from export_model.converters.graph.ops.barracuda.values import Value
+from export_model.converters.graph.ops.base import MISFIT, OpDef, misfit
+from export_model.converters.graph.ops.table import is_fed, op_of, traits
+from export_model.converters.graph.shapes import run_kernel
+from export_model.converters.graph.types import BATCH
+from export_model.signatures.errors import UnsupportedOpError
 
 
 def lower_graph(b: NnBuilder, graph: Graph, given: dict[str, Value], wanted: Iterable[str]) -> dict[str, Value]:

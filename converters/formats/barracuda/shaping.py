@@ -10,10 +10,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from converters.formats.barracuda.format import EIGHT_AXES
-from converters.formats.barracuda.layer_builder import LayerBuilder, Shape, Value, with_length
-from converters.graph.ops.barracuda.vocabulary import C, H, N, W
-from converters.graph.types import INT32
+from export_model.converters.formats.barracuda.format import EIGHT_AXES
+from export_model.converters.formats.barracuda.layer_builder import LayerBuilder, Shape, Value, with_length
+from export_model.converters.graph.ops.barracuda.vocabulary import C, H, N, W
+from export_model.converters.graph.types import INT32
 
 _NAMES = "NHWC"
 #: Positions of N, H, W, C in the eight-entry shapes of versions from 17 on: S, R, N, T, D, H, W, C.

@@ -13,10 +13,10 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from msgspec.structs import replace
 
-from converters.formats.barracuda.format import Layer, NnModel
-from converters.graph.nodes import reachable
-from converters.graph.ops.barracuda.vocabulary import Activation, LayerType
-from signatures.roles import ACTION_SHAPE
+from export_model.converters.formats.barracuda.format import Layer, NnModel
+from export_model.converters.graph.nodes import reachable
+from export_model.converters.graph.ops.barracuda.vocabulary import Activation, LayerType
+from export_model.signatures.roles import ACTION_SHAPE
 
 _MASKS = "action_masks"
 

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from msgspec.structs import replace
 
-from converters.files.fetch import Fetched
-from converters.formats.barracuda.format import NnModel, parse
-from converters.formats.barracuda.graph import to_graph
-from converters.formats.barracuda.slices import with_slices
-from converters.formats.barracuda.writer import PRODUCER, contract_of
-from converters.formats.source import ReadOptions, SourceModel
-from converters.policy.facts import SourceFacts
-from signatures.contract import EMBEDDED
-from signatures.roles import ACTION_NAMES, VERSION_NUMBER
-from signatures.spec import PolicySignature
+from export_model.converters.files.fetch import Fetched
+from export_model.converters.formats.barracuda.format import NnModel, parse
+from export_model.converters.formats.barracuda.graph import to_graph
+from export_model.converters.formats.barracuda.slices import with_slices
+from export_model.converters.formats.barracuda.writer import PRODUCER, contract_of
+from export_model.converters.formats.source import ReadOptions, SourceModel
+from export_model.converters.policy.facts import SourceFacts
+from export_model.signatures.contract import EMBEDDED
+from export_model.signatures.roles import ACTION_NAMES, VERSION_NUMBER
+from export_model.signatures.spec import PolicySignature
 
 #: Suffixes that ML-Agents' converter gives to memories: the cell state and the hidden state of an LSTM; a GRU has h.
 _PARTS = ("_c", "_h")

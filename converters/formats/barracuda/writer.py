@@ -13,8 +13,8 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
-from converters.files.chunks import Pieces
-from converters.formats.barracuda.format import (
+from export_model.converters.files.chunks import Pieces
+from export_model.converters.formats.barracuda.format import (
     ALIGNED,
     ALIGNMENT,
     METADATA,
@@ -25,13 +25,13 @@ from converters.formats.barracuda.format import (
     Trailer,
     parse,
 )
-from converters.formats.barracuda.lower import policy_model
-from converters.formats.format import WriteOptions
-from converters.policy.policy import Policy
-from signatures.contract import EMBEDDED, json_of, parse_signature
-from signatures.errors import DamagedFileError
-from signatures.fields import FieldError
-from signatures.spec import PolicySignature
+from export_model.converters.formats.barracuda.lower import policy_model
+from export_model.converters.formats.format import WriteOptions
+from export_model.converters.policy.policy import Policy
+from export_model.signatures.contract import EMBEDDED, json_of, parse_signature
+from export_model.signatures.errors import DamagedFileError
+from export_model.signatures.fields import FieldError
+from export_model.signatures.spec import PolicySignature
 
 #: What Barracuda has for a model that no file was imported for.
 _NO_SOURCE, _NO_VERSION = "Script", "NA"

@@ -14,18 +14,18 @@ from typing import Any, TypeAlias
 from msgspec import Struct
 from msgspec.structs import replace
 
-from converters.files.fetch import inside, neighbours, path_text
-from converters.formats.bundle.embed import contract_text, without_contract
-from converters.formats.bundle.exchange import exchange, recover, stage, take_away
-from converters.formats.format import Artifact, Format
-from converters.formats.frozen_graph.reader import read_graph
-from converters.graph.nodes import Graph
-from converters.graph.shapes import infer_types
-from signatures.contract import PARITY, POLICY, Contract, FileEntry, json_of, parse
-from signatures.digest import sha256_of_file
-from signatures.errors import BundleError, UsageError
-from signatures.fields import WHOLE, FieldError
-from signatures.spec import PolicySignature
+from export_model.converters.files.fetch import inside, neighbours, path_text
+from export_model.converters.formats.bundle.embed import contract_text, without_contract
+from export_model.converters.formats.bundle.exchange import exchange, recover, stage, take_away
+from export_model.converters.formats.format import Artifact, Format
+from export_model.converters.formats.frozen_graph.reader import read_graph
+from export_model.converters.graph.nodes import Graph
+from export_model.converters.graph.shapes import infer_types
+from export_model.signatures.contract import PARITY, POLICY, Contract, FileEntry, json_of, parse
+from export_model.signatures.digest import sha256_of_file
+from export_model.signatures.errors import BundleError, UsageError
+from export_model.signatures.fields import WHOLE, FieldError
+from export_model.signatures.spec import PolicySignature
 
 #: Tensor → what its artefact says of it: dtype and shape.
 Declared: TypeAlias = Mapping[str, tuple[str | None, Sequence[object] | None]]

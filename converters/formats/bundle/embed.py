@@ -13,19 +13,19 @@ from typing import Any
 import numpy as np
 from msgspec.structs import replace
 
-from converters.compiler.passes.normalise import normalise
-from converters.compiler.passes.signature import derived_notes
-from converters.formats.frozen_graph.encode import string_constant
-from converters.formats.frozen_graph.reader import read_graph
-from converters.graph.nodes import Graph, NameScope, Node, topological
-from converters.graph.ops.table import traits
-from converters.policy.facts import SourceFacts
-from signatures.contract import EMBEDDED, Contract, json_of, parse
-from signatures.errors import DamagedFileError
-from signatures.fields import FieldError
-from signatures.memories import SeparateMemory
-from signatures.roles import Role
-from signatures.spec import PolicySignature
+from export_model.converters.compiler.passes.normalise import normalise
+from export_model.converters.compiler.passes.signature import derived_notes
+from export_model.converters.formats.frozen_graph.encode import string_constant
+from export_model.converters.formats.frozen_graph.reader import read_graph
+from export_model.converters.graph.nodes import Graph, NameScope, Node, topological
+from export_model.converters.graph.ops.table import traits
+from export_model.converters.policy.facts import SourceFacts
+from export_model.signatures.contract import EMBEDDED, Contract, json_of, parse
+from export_model.signatures.errors import DamagedFileError
+from export_model.signatures.fields import FieldError
+from export_model.signatures.memories import SeparateMemory
+from export_model.signatures.roles import Role
+from export_model.signatures.spec import PolicySignature
 
 #: How the note begins of files that were made for a fixed number of agents; it is about the file, not the policy.
 FIXED_BATCH = "made for batches of "

@@ -18,7 +18,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from converters.files.folders import LeftoverWarning, OwnFolder, left_in, sweep, try_lock
+from export_model.converters.files.folders import LeftoverWarning, OwnFolder, left_in, sweep, try_lock
 
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
 _PREFIX = ".export-model-"

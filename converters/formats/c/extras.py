@@ -9,11 +9,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from converters.formats.c.text import C_TYPES, C
-from converters.formats.programs.plan import Guarded, Plan
-from converters.graph.language import lines_of
-from converters.graph.printer import Printer
-from converters.graph.program import Place
+from export_model.converters.formats.c.text import C_TYPES, C
+from export_model.converters.formats.programs.plan import Guarded, Plan
+from export_model.converters.graph.language import lines_of
+from export_model.converters.graph.printer import Printer
+from export_model.converters.graph.program import Place
 
 _LOAD = """
 /* Bit by bit: the CRC-32 of zlib, PNG and Ethernet. */

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from converters.graph.language import Language, bare, lines_of
-from converters.graph.program import Place
-from converters.graph.types import FLOAT32, INT64
+from export_model.converters.graph.language import Language, bare, lines_of
+from export_model.converters.graph.program import Place
+from export_model.converters.graph.types import FLOAT32, INT64
 
 #: What C calls a dtype; a truth is an int, as C's comparisons are.
 C_TYPES = {

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from msgspec.structs import replace
 
-from converters.files.chunks import Pieces
-from converters.formats.c.extras import (
+from export_model.converters.files.chunks import Pieces
+from export_model.converters.formats.c.extras import (
     LOAD_SAID,
     UNUSUAL_SAID,
     load_text,
@@ -17,16 +17,16 @@ from converters.formats.c.extras import (
     sizes_text,
     unusual_text,
 )
-from converters.formats.c.text import C_TYPES, C
-from converters.formats.format import WriteOptions
-from converters.formats.programs.members import Field
-from converters.formats.programs.plan import CLOSE, NAN_SAID, ROWS, Plan, formula, write_program
-from converters.formats.programs.weights import weights_name, widen_where_used
-from converters.graph.ops.loops.layers import box_muller, gumbel
-from converters.graph.printer import Printer
-from converters.graph.program import arena_of
-from converters.policy.policy import Policy
-from signatures.errors import UnsupportedOpError
+from export_model.converters.formats.c.text import C_TYPES, C
+from export_model.converters.formats.format import WriteOptions
+from export_model.converters.formats.programs.members import Field
+from export_model.converters.formats.programs.plan import CLOSE, NAN_SAID, ROWS, Plan, formula, write_program
+from export_model.converters.formats.programs.weights import weights_name, widen_where_used
+from export_model.converters.graph.ops.loops.layers import box_muller, gumbel
+from export_model.converters.graph.printer import Printer
+from export_model.converters.graph.program import arena_of
+from export_model.converters.policy.policy import Policy
+from export_model.signatures.errors import UnsupportedOpError
 
 _DRAWS = """
 /* The stream of draws: splitmix64 (Steele, Lea and Flood 2014), its top 23 bits, in the middle of their step: above 0,

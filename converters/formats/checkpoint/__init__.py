@@ -6,12 +6,12 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from converters.formats.format import Format, defer_imports
+from export_model.converters.formats.format import Format, defer_imports
 
 if TYPE_CHECKING:
-    from converters.files.file_probe import Content
-    from converters.formats.checkpoint import listing as _listing
-    from converters.formats.checkpoint import source as _source
+    from export_model.converters.files.file_probe import Content
+    from export_model.converters.formats.checkpoint import listing as _listing
+    from export_model.converters.formats.checkpoint import source as _source
 else:
     _listing, _source = defer_imports(__name__, "listing", "source")
 

@@ -13,16 +13,16 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from converters.files import tensorflow_messages as schema
-from converters.files.external_data import Detached
-from converters.formats.checkpoint.tensor_bundle import Extents, several
-from converters.formats.checkpoint.training_graph import Saved, TrainingGraph
-from converters.formats.frozen_graph.tensors import constant
-from converters.graph.nodes import Graph, NameScope, Node, node_of, topological
-from converters.graph.ops.table import EFFECTS, VARIABLES, hands_on
-from converters.policy.brains import depends_on_input, find_brains
-from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError
-from signatures.roles import CONSTANT_NAMES
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.files.external_data import Detached
+from export_model.converters.formats.checkpoint.tensor_bundle import Extents, several
+from export_model.converters.formats.checkpoint.training_graph import Saved, TrainingGraph
+from export_model.converters.formats.frozen_graph.tensors import constant
+from export_model.converters.graph.nodes import Graph, NameScope, Node, node_of, topological
+from export_model.converters.graph.ops.table import EFFECTS, VARIABLES, hands_on
+from export_model.converters.policy.brains import depends_on_input, find_brains
+from export_model.signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError
+from export_model.signatures.roles import CONSTANT_NAMES
 
 _IN_A_CHECKPOINT = "it is the graph that training started from; the values are in a checkpoint, and none lies beside it"
 _GIVE_THAT = "give the checkpoint (model-<step>.cptk.index), or the frozen graph that training wrote when it ended"

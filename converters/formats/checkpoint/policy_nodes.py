@@ -13,11 +13,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from converters.formats.checkpoint.freeze import is_effect
-from converters.graph.nodes import Graph, Node, node_of, topological
-from converters.policy.brains import find_brains
-from signatures.errors import ExportModelError
-from signatures.roles import OUTPUT_NAMES, TRAINER_VERSION, VERSION_NUMBER, Constant, numbers
+from export_model.converters.formats.checkpoint.freeze import is_effect
+from export_model.converters.graph.nodes import Graph, Node, node_of, topological
+from export_model.converters.policy.brains import find_brains
+from export_model.signatures.errors import ExportModelError
+from export_model.signatures.roles import OUTPUT_NAMES, TRAINER_VERSION, VERSION_NUMBER, Constant, numbers
 
 _SAMPLED = "action/Multinomial"
 _CLONED = frozenset(("action", "recurrent_out"))

@@ -8,19 +8,26 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
-from converters.files.external_data import Detached
-from converters.files.fetch import Fetched
-from converters.formats.checkpoint import listing
-from converters.formats.checkpoint.freeze import freeze, with_values
-from converters.formats.checkpoint.listing import STEPPED, Behavior, behaviors, best, graph_of, unread_folders
-from converters.formats.checkpoint.policy_nodes import policy_nodes
-from converters.formats.checkpoint.table import MAGIC
-from converters.formats.checkpoint.tensor_bundle import Checkpoint, of_objects, version_1
-from converters.formats.checkpoint.training_graph import read_training_graph
-from converters.formats.format import Member
-from converters.formats.source import OriginalRun, ReadOptions, SourceModel
-from converters.policy.facts import SourceFacts
-from signatures.errors import ExportModelError, SourceError, UsageError
+from export_model.converters.files.external_data import Detached
+from export_model.converters.files.fetch import Fetched
+from export_model.converters.formats.checkpoint import listing
+from export_model.converters.formats.checkpoint.freeze import freeze, with_values
+from export_model.converters.formats.checkpoint.listing import (
+    STEPPED,
+    Behavior,
+    behaviors,
+    best,
+    graph_of,
+    unread_folders,
+)
+from export_model.converters.formats.checkpoint.policy_nodes import policy_nodes
+from export_model.converters.formats.checkpoint.table import MAGIC
+from export_model.converters.formats.checkpoint.tensor_bundle import Checkpoint, of_objects, version_1
+from export_model.converters.formats.checkpoint.training_graph import read_training_graph
+from export_model.converters.formats.format import Member
+from export_model.converters.formats.source import OriginalRun, ReadOptions, SourceModel
+from export_model.converters.policy.facts import SourceFacts
+from export_model.signatures.errors import ExportModelError, SourceError, UsageError
 
 _PARTS = re.compile(r"(?P<prefix>.+)\.(index|meta|data-\d{5}-of-\d{5})")
 

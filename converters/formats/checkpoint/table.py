@@ -11,9 +11,9 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 
-from converters.files.wire_format import read_varint
-from converters.formats.checkpoint.crc32c import crc32c, mask_crc
-from signatures.errors import DamagedFileError
+from export_model.converters.files.wire_format import read_varint
+from export_model.converters.formats.checkpoint.crc32c import crc32c, mask_crc
+from export_model.signatures.errors import DamagedFileError
 
 MAGIC = struct.pack("<Q", 0xDB4775248B80FB57)
 _FOOTER, _TRAILER = 48, 5

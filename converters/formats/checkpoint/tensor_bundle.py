@@ -20,11 +20,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from converters.files import tensorflow_messages as schema
-from converters.files.fetch import MAX_WEIGHTS, open_regular_file, read_bytes
-from converters.formats.checkpoint.crc32c import crc32c, mask_crc
-from converters.formats.checkpoint.table import read_table
-from signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError, SourceError
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.files.fetch import MAX_WEIGHTS, open_regular_file, read_bytes
+from export_model.converters.formats.checkpoint.crc32c import crc32c, mask_crc
+from export_model.converters.formats.checkpoint.table import read_table
+from export_model.signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError, SourceError
 
 _MAX_AXES = 32
 _MAX_SLICES = 1 << 12

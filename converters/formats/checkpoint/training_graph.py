@@ -15,15 +15,15 @@ from typing import Any
 import numpy as np
 from msgspec import Struct, field
 
-from converters.files import tensorflow_messages as schema
-from converters.files.external_data import Detached
-from converters.files.fetch import read_bytes
-from converters.formats.checkpoint.tensor_bundle import Extents
-from converters.formats.frozen_graph.reader import from_graph_def
-from converters.formats.frozen_graph.tensors import to_array
-from converters.graph.nodes import Graph, node_of, split_ref
-from converters.graph.ops.table import ASSIGNS, RESTORES
-from signatures.errors import DamagedFileError, NotAPolicyError
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.files.external_data import Detached
+from export_model.converters.files.fetch import read_bytes
+from export_model.converters.formats.checkpoint.tensor_bundle import Extents
+from export_model.converters.formats.frozen_graph.reader import from_graph_def
+from export_model.converters.formats.frozen_graph.tensors import to_array
+from export_model.converters.graph.nodes import Graph, node_of, split_ref
+from export_model.converters.graph.ops.table import ASSIGNS, RESTORES
+from export_model.signatures.errors import DamagedFileError, NotAPolicyError
 
 
 class Saved(Struct, frozen=True):

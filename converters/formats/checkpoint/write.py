@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from converters.files import tensorflow_messages as schema
-from converters.files.chunks import Pieces
-from converters.files.wire_format import varint
-from converters.formats.checkpoint.crc32c import crc32c, mask_crc
-from converters.formats.checkpoint.table import MAGIC
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.files.chunks import Pieces
+from export_model.converters.files.wire_format import varint
+from export_model.converters.formats.checkpoint.crc32c import crc32c, mask_crc
+from export_model.converters.formats.checkpoint.table import MAGIC
 
 
 def checkpoint(values: Mapping[str, np.ndarray]) -> dict[str, Pieces]:

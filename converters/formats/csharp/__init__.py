@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from converters.formats.format import defer_imports
-from converters.formats.programs import program_format
+from export_model.converters.formats.format import defer_imports
+from export_model.converters.formats.programs import program_format
 
 if TYPE_CHECKING:
-    from converters.formats.csharp import writer as _writer
+    from export_model.converters.formats.csharp import writer as _writer
 else:
     (_writer,) = defer_imports(__name__, "writer")
 

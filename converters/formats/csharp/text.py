@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from converters.formats.programs.weights import Kept
-from converters.graph.blocks import LANES, TERMS, Packed
-from converters.graph.language import Language, bare, lines_of
-from converters.graph.ops.loops.base import Applied
-from converters.graph.types import BOOL, FLOAT32, INT32, INT64
+from export_model.converters.formats.programs.weights import Kept
+from export_model.converters.graph.blocks import LANES, TERMS, Packed
+from export_model.converters.graph.language import Language, bare, lines_of
+from export_model.converters.graph.ops.loops.base import Applied
+from export_model.converters.graph.types import BOOL, FLOAT32, INT32, INT64
 
 #: What C# calls a dtype.
 CS_TYPES = {"float32": "float", "int32": "int", "int64": "long", "bool": "bool", "int8": "sbyte", "float16": "ushort"}

@@ -7,17 +7,17 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from converters.files.chunks import Pieces
-from converters.formats.csharp.text import CS_TYPES, CSharp
-from converters.formats.format import WriteOptions
-from converters.formats.programs.members import Field
-from converters.formats.programs.plan import CLOSE, NAN_SAID, ROWS, Plan, formula, write_program
-from converters.formats.programs.weights import weights_name
-from converters.graph.ops.loops.layers import box_muller, gumbel
-from converters.graph.printer import Printer
-from converters.graph.program import Place
-from converters.policy.policy import Policy
-from signatures.roles import Role
+from export_model.converters.files.chunks import Pieces
+from export_model.converters.formats.csharp.text import CS_TYPES, CSharp
+from export_model.converters.formats.format import WriteOptions
+from export_model.converters.formats.programs.members import Field
+from export_model.converters.formats.programs.plan import CLOSE, NAN_SAID, ROWS, Plan, formula, write_program
+from export_model.converters.formats.programs.weights import weights_name
+from export_model.converters.graph.ops.loops.layers import box_muller, gumbel
+from export_model.converters.graph.printer import Printer
+from export_model.converters.graph.program import Place
+from export_model.converters.policy.policy import Policy
+from export_model.signatures.roles import Role
 
 _UNIFORM = """
     /// <summary>The stream of draws, splitmix64: above 0, below 1. The same seed, the same draws as in C.</summary>

@@ -12,16 +12,16 @@ from pathlib import Path
 
 import numpy as np
 
-from converters.files import tensorflow_messages as schema
-from converters.files.external_data import Detached
-from converters.files.fetch import read_bytes
-from converters.files.memory_mapped import Mapped
-from converters.formats.format import Port, Ports
-from converters.formats.frozen_graph.reader import from_graph_def, read_graph
-from converters.formats.frozen_graph.subgraph import subgraph
-from converters.formats.intermediate_tensors import Feeds, InnerTensors, Loaded, own_names, samplers_of
-from converters.graph.nodes import Graph, node_of
-from converters.graph.ops.table import is_fed
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.files.external_data import Detached
+from export_model.converters.files.fetch import read_bytes
+from export_model.converters.files.memory_mapped import Mapped
+from export_model.converters.formats.format import Port, Ports
+from export_model.converters.formats.frozen_graph.reader import from_graph_def, read_graph
+from export_model.converters.formats.frozen_graph.subgraph import subgraph
+from export_model.converters.formats.intermediate_tensors import Feeds, InnerTensors, Loaded, own_names, samplers_of
+from export_model.converters.graph.nodes import Graph, node_of
+from export_model.converters.graph.ops.table import is_fed
 
 
 def ports(path: Path) -> Ports:

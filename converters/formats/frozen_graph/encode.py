@@ -11,14 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from converters.files import tensorflow_messages as schema
-from converters.files.external_data import Detached
-from converters.formats.frozen_graph.tensors import from_array
-from converters.graph.nodes import Graph, Node, TensorShape
-from converters.graph.ops.base import REQUIRED, Attr
-from converters.graph.ops.table import op_of
-from converters.graph.shapes import Types, infer_types
-from signatures.errors import GraphError, UnsupportedOpError
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.files.external_data import Detached
+from export_model.converters.formats.frozen_graph.tensors import from_array
+from export_model.converters.graph.nodes import Graph, Node, TensorShape
+from export_model.converters.graph.ops.base import REQUIRED, Attr
+from export_model.converters.graph.ops.table import op_of
+from export_model.converters.graph.shapes import Types, infer_types
+from export_model.signatures.errors import GraphError, UnsupportedOpError
 
 #: GraphDef version written: that of TF 1.4. (Graphs frozen by TF 1.x carry none, which TensorFlow.js cannot read.)
 PRODUCER = 24

@@ -1,7 +1,7 @@
 """GraphDef bytes to Graph.
 
 The reader takes the file as it is: all ops, all attributes, training part included. What the policy needs is decided
-later (``converters.compiler.passes``), so that a graph with unknown training ops can still be read.
+later (``export_model.converters.compiler.passes``), so that a graph with unknown training ops can still be read.
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from converters.files import tensorflow_messages as schema
-from converters.files.external_data import Detached
-from converters.formats.frozen_graph.tensors import lacks_values, to_array
-from converters.graph.nodes import Graph, Node, TensorShape, node_of, normal_ref, topological
-from converters.graph.ops.table import CALLS, is_fed
-from converters.graph.size_limits import Allowance
-from signatures.errors import DamagedFileError, NotAPolicyError
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.files.external_data import Detached
+from export_model.converters.formats.frozen_graph.tensors import lacks_values, to_array
+from export_model.converters.graph.nodes import Graph, Node, TensorShape, node_of, normal_ref, topological
+from export_model.converters.graph.ops.table import CALLS, is_fed
+from export_model.converters.graph.size_limits import Allowance
+from export_model.signatures.errors import DamagedFileError, NotAPolicyError
 
 #: Before this GraphDef version a Placeholder's ``shape {}`` meant "unknown", not "scalar" (array_ops.cc, Placeholder).
 SCALAR_SHAPE_PRODUCER = 24

@@ -13,10 +13,17 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from converters.files import tensorflow_messages as schema
-from converters.graph.nodes import Node, node_of, reachable
-from converters.graph.ops.table import CONTROL_FLOW, OF_VALUES, ORDERING, SPELLINGS, TABLE, unsupported_error
-from signatures.errors import GraphError
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.graph.nodes import Node, node_of, reachable
+from export_model.converters.graph.ops.table import (
+    CONTROL_FLOW,
+    OF_VALUES,
+    ORDERING,
+    SPELLINGS,
+    TABLE,
+    unsupported_error,
+)
+from export_model.signatures.errors import GraphError
 
 #: Ops that compute a value from their inputs (or draw one) and do nothing else.
 COMPUTING = frozenset((*TABLE, *CONTROL_FLOW, *SPELLINGS))

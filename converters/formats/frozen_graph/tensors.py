@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from converters.files.external_data import Detached
-from converters.files.tensorflow_messages import TensorProto, dtype_number, dtype_of, node_def
-from converters.graph.size_limits import Allowance
-from signatures.errors import DamagedFileError
+from export_model.converters.files.external_data import Detached
+from export_model.converters.files.tensorflow_messages import TensorProto, dtype_number, dtype_of, node_def
+from export_model.converters.graph.size_limits import Allowance
+from export_model.signatures.errors import DamagedFileError
 
 _MAX_AXES = 32
 _MAX_ELEMENTS = 1 << 31

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from typing import Any
 
-from converters.compiler.passes.weights import Storage, store_compactly
-from converters.files import tensorflow_messages as schema
-from converters.files.chunks import Pieces
-from converters.files.external_data import Detached, is_readable
-from converters.formats.bundle.embed import with_contract
-from converters.formats.format import WriteOptions
-from converters.formats.frozen_graph.encode import encode
-from converters.graph.nodes import Graph
-from converters.policy.policy import Policy
-from signatures.errors import TooLargeError
+from export_model.converters.compiler.passes.weights import Storage, store_compactly
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.files.chunks import Pieces
+from export_model.converters.files.external_data import Detached, is_readable
+from export_model.converters.formats.bundle.embed import with_contract
+from export_model.converters.formats.format import WriteOptions
+from export_model.converters.formats.frozen_graph.encode import encode
+from export_model.converters.graph.nodes import Graph
+from export_model.converters.policy.policy import Policy
+from export_model.signatures.errors import TooLargeError
 
 
 def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:

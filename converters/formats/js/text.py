@@ -6,12 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from converters.formats.programs.weights import Kept
-from converters.graph.language import Language, bare, lines_of
-from converters.graph.ops.loops.base import Applied, Element
-from converters.graph.ops.loops.own_math import OWN
-from converters.graph.program import every
-from converters.graph.types import BOOL, FLOAT32, INT32, INT64
+from export_model.converters.formats.programs.weights import Kept
+from export_model.converters.graph.language import Language, bare, lines_of
+from export_model.converters.graph.ops.loops.base import Applied, Element
+from export_model.converters.graph.ops.loops.own_math import OWN
+from export_model.converters.graph.program import every
+from export_model.converters.graph.types import BOOL, FLOAT32, INT32, INT64
 
 #: The arrays of each dtype. int64 is held in doubles, which have every whole number up to 2 to the 53.
 JS_ARRAYS = {

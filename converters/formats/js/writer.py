@@ -9,16 +9,16 @@ from typing import Any
 import numpy as np
 from msgspec import Struct
 
-from converters.files.chunks import Pieces
-from converters.formats.format import WriteOptions
-from converters.formats.js.text import JS_ARRAYS, JavaScript
-from converters.formats.programs.members import Field
-from converters.formats.programs.plan import CLOSE, NAN_SAID, ROWS, Plan, formula, plan_of, write_program
-from converters.formats.programs.weights import weights_name
-from converters.graph.ops.loops.layers import box_muller, gumbel
-from converters.graph.printer import Printer
-from converters.policy.policy import Policy
-from signatures.roles import Role
+from export_model.converters.files.chunks import Pieces
+from export_model.converters.formats.format import WriteOptions
+from export_model.converters.formats.js.text import JS_ARRAYS, JavaScript
+from export_model.converters.formats.programs.members import Field
+from export_model.converters.formats.programs.plan import CLOSE, NAN_SAID, ROWS, Plan, formula, plan_of, write_program
+from export_model.converters.formats.programs.weights import weights_name
+from export_model.converters.graph.ops.loops.layers import box_muller, gumbel
+from export_model.converters.graph.printer import Printer
+from export_model.converters.policy.policy import Policy
+from export_model.signatures.roles import Role
 
 _UNIFORM = """
     /** The stream of draws, splitmix64: above 0, below 1. The same seed gives the same draws as in C and C#. */

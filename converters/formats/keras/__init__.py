@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from converters.formats.format import Format, defer_imports
+from export_model.converters.formats.format import Format, defer_imports
 
 if TYPE_CHECKING:
-    from converters.formats.keras import source as _source
+    from export_model.converters.formats.keras import source as _source
 else:
     (_source,) = defer_imports(__name__, "source")
 

@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 from msgspec import Struct
 
-from converters.files.children.process import RunFailedError, RuntimeProcess
-from converters.files.children.python import child_command, module_origin
-from converters.formats.saved_model.signature import ModelSignature, signature_of
-from signatures.errors import DamagedFileError, RuntimeUnavailableError, SourceError
+from export_model.converters.files.children.process import RunFailedError, RuntimeProcess
+from export_model.converters.files.children.python import child_command, module_origin
+from export_model.converters.formats.saved_model.signature import ModelSignature, signature_of
+from export_model.signatures.errors import DamagedFileError, RuntimeUnavailableError, SourceError
 
 
 class Stored(Struct, frozen=True):
@@ -45,7 +45,9 @@ def stored_in(path: Path) -> Stored:
         )
     try:
         # 20 kB can keep the HDF5 library busy for ever, so that reading has the processor time of any untrusted file.
-        with RuntimeProcess("h5py", child_command("converters.formats.keras.hdf5_child"), timed_out=set()) as process:
+        with RuntimeProcess(
+            "h5py", child_command("export_model.converters.formats.keras.hdf5_child"), timed_out=set()
+        ) as process:
             answer = process.load(str(path.absolute())).run({}, [])
     except RunFailedError as error:
         raise DamagedFileError(
@@ -70,7 +72,9 @@ def frozen_by_tensorflow(path: Path) -> tuple[bytes, ModelSignature]:
             fix="pip install 'export-model[tensorflow]'; or freeze the model where it was made, and give the GraphDef",
         )
     try:
-        with RuntimeProcess("tensorflow", child_command("converters.runtimes.tensorflow.child")) as process:
+        with RuntimeProcess(
+            "tensorflow", child_command("export_model.converters.runtimes.tensorflow.child")
+        ) as process:
             answer = process.load(str(path.absolute()), kind="keras").run({}, ["graph", "names"])
     except RunFailedError as error:
         raise SourceError(

@@ -13,10 +13,10 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from converters.files.fetch import read_bytes
-from converters.files.file_probe import json_in
-from converters.files.zip_archives import ZIP_ERRORS, entry_of, open_archive
-from signatures.errors import DamagedFileError, NotAPolicyError, SourceError
+from export_model.converters.files.fetch import read_bytes
+from export_model.converters.files.file_probe import json_in
+from export_model.converters.files.zip_archives import ZIP_ERRORS, entry_of, open_archive
+from export_model.signatures.errors import DamagedFileError, NotAPolicyError, SourceError
 
 #: Bytes of a configuration; Keras' largest models have one of 2 MB.
 MAX_CONFIG = 16 << 20

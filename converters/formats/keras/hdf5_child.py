@@ -1,6 +1,6 @@
 """The arrays and the configuration of an HDF5 file, read by h5py in a confined process.
 
-``python -m converters.formats.keras.hdf5_child``. Loads by ``path`` an ``.h5``, or a ``.keras``'s
+``python -m export_model.converters.formats.keras.hdf5_child``. Loads by ``path`` an ``.h5``, or a ``.keras``'s
 ``model.weights.h5``; run, it gives JSON as ``index`` ({"config", "version", "training", "names",
 "arrays": [[layer, name], …]}), and the arrays as ``0``, ``1``, …; none of an ``.h5`` that is no model, whose names say
 what it is.
@@ -20,11 +20,11 @@ from typing import Any
 
 import numpy as np
 
-from converters.files.children.child import claim_stdout, serve
-from converters.files.children.frames import Tensors
-from converters.files.zip_archives import ZIP_ERRORS, entry_of, open_archive
-from converters.formats.keras.config import MAX_CONFIG
-from signatures.errors import DamagedFileError, ExportModelError
+from export_model.converters.files.children.child import claim_stdout, serve
+from export_model.converters.files.children.frames import Tensors
+from export_model.converters.files.zip_archives import ZIP_ERRORS, entry_of, open_archive
+from export_model.converters.formats.keras.config import MAX_CONFIG
+from export_model.signatures.errors import DamagedFileError, ExportModelError
 
 WEIGHTS = "model.weights.h5"
 _MAX_DEPTH, _MAX_ENTRIES = 32, 1 << 14

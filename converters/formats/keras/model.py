@@ -12,9 +12,9 @@ from typing import Any
 from msgspec import Struct, field
 from msgspec.structs import replace
 
-from converters.compiler.passes.unroll import MAX_NODES
-from converters.graph.nodes import NameScope
-from signatures.errors import DamagedFileError, NotAPolicyError
+from export_model.converters.compiler.passes.unroll import MAX_NODES
+from export_model.converters.graph.nodes import NameScope
+from export_model.signatures.errors import DamagedFileError, NotAPolicyError
 
 #: Classes that are models themselves.
 MODELS = frozenset(("Functional", "Model", "Sequential"))

@@ -7,19 +7,19 @@ from typing import Any
 
 import numpy as np
 
-from converters.compiler.passes.unroll import MAX_NODES
-from converters.formats.keras.layers.resizing import UNTRAINED
-from converters.formats.keras.layers.step import Step
-from converters.formats.keras.layers.table import LAYERS, OPERATIONS
-from converters.formats.keras.model import Layer, LayeredModel, Place, input_shape, tensors_in
-from converters.formats.keras.weights import Weights
-from converters.formats.saved_model.signature import ModelSignature, Tensor
-from converters.graph.builder import Builder
-from converters.graph.nodes import MAX_NAME, NameScope, Node, TensorShape
-from converters.graph.types import FLOAT32
-from signatures.errors import DamagedFileError, NotAPolicyError, UnsupportedOpError
-from signatures.memories import SeparateMemory
-from signatures.spec import DTYPES
+from export_model.converters.compiler.passes.unroll import MAX_NODES
+from export_model.converters.formats.keras.layers.resizing import UNTRAINED
+from export_model.converters.formats.keras.layers.step import Step
+from export_model.converters.formats.keras.layers.table import LAYERS, OPERATIONS
+from export_model.converters.formats.keras.model import Layer, LayeredModel, Place, input_shape, tensors_in
+from export_model.converters.formats.keras.weights import Weights
+from export_model.converters.formats.saved_model.signature import ModelSignature, Tensor
+from export_model.converters.graph.builder import Builder
+from export_model.converters.graph.nodes import MAX_NAME, NameScope, Node, TensorShape
+from export_model.converters.graph.types import FLOAT32
+from export_model.signatures.errors import DamagedFileError, NotAPolicyError, UnsupportedOpError
+from export_model.signatures.memories import SeparateMemory
+from export_model.signatures.spec import DTYPES
 
 Results = dict[tuple[str, int], list[str]]
 _RECURRENT = frozenset(("LSTM", "GRU", "SimpleRNN", "RNN"))

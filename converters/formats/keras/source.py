@@ -12,22 +12,33 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from converters.files import tensorflow_messages as schema
-from converters.files.fetch import Fetched
-from converters.files.file_probe import json_in
-from converters.formats.frozen_graph.reader import from_graph_def
-from converters.formats.keras.children import frozen_by_tensorflow, stored_in
-from converters.formats.keras.config import config_of, loss_of, no_configuration, refuse_code, stateful_layer
-from converters.formats.keras.model import model_of
-from converters.formats.keras.network import Network, UnknownLayerError
-from converters.formats.keras.weights import Groups, Listed, Weights
-from converters.formats.saved_model.signature import declared_outputs, expose, expose_signature, output_names
-from converters.formats.source import OriginalRun, ReadOptions, SourceModel
-from converters.graph.nodes import Graph
-from converters.graph.ops.base import MISFIT
-from converters.graph.ops.table import is_fed
-from converters.policy.facts import SourceFacts
-from signatures.errors import DamagedFileError, RuntimeUnavailableError
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.files.fetch import Fetched
+from export_model.converters.files.file_probe import json_in
+from export_model.converters.formats.frozen_graph.reader import from_graph_def
+from export_model.converters.formats.keras.children import frozen_by_tensorflow, stored_in
+from export_model.converters.formats.keras.config import (
+    config_of,
+    loss_of,
+    no_configuration,
+    refuse_code,
+    stateful_layer,
+)
+from export_model.converters.formats.keras.model import model_of
+from export_model.converters.formats.keras.network import Network, UnknownLayerError
+from export_model.converters.formats.keras.weights import Groups, Listed, Weights
+from export_model.converters.formats.saved_model.signature import (
+    declared_outputs,
+    expose,
+    expose_signature,
+    output_names,
+)
+from export_model.converters.formats.source import OriginalRun, ReadOptions, SourceModel
+from export_model.converters.graph.nodes import Graph
+from export_model.converters.graph.ops.base import MISFIT
+from export_model.converters.graph.ops.table import is_fed
+from export_model.converters.policy.facts import SourceFacts
+from export_model.signatures.errors import DamagedFileError, RuntimeUnavailableError
 
 _SAVE_AGAIN = "save the model again: model.save('policy.keras')"
 

@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from converters.formats.keras.model import Layer, cells_of
+from export_model.converters.formats.keras.model import Layer, cells_of
 
 Arrays = tuple[np.ndarray, ...]
 #: Under which names the parts of a layer lie, in the order in which Keras makes them; "_" may stand before each.

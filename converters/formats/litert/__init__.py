@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from converters.formats.format import Code, Format, defer_imports
+from export_model.converters.formats.format import Code, Format, defer_imports
 
 if TYPE_CHECKING:
-    from converters.formats.litert import artifact as _artifact
-    from converters.formats.litert import source as _source
-    from converters.formats.litert import writer as _writer
+    from export_model.converters.formats.litert import artifact as _artifact
+    from export_model.converters.formats.litert import source as _source
+    from export_model.converters.formats.litert import writer as _writer
 else:
     _artifact, _source, _writer = defer_imports(__name__, "artifact", "source", "writer")
 

@@ -9,16 +9,16 @@ from pathlib import Path
 
 import numpy as np
 
-from converters.files.fetch import read_bytes
-from converters.files.folders import scratch_folder
-from converters.formats.format import Port, Ports
-from converters.formats.intermediate_tensors import Feeds, InnerTensors, Loaded, RunAll, Sampler, View
-from converters.formats.litert.flatbuffer import Table, decode, encode
-from converters.formats.litert.schema import BUILTINS, OPERATOR_NAMES
-from converters.formats.litert.tensors import dims_of, dtype_of, entry_of, needed_operators
-from converters.formats.onnx.tensor_map import TENSORS_KEY, loads
-from signatures.contract import EMBEDDED
-from signatures.errors import UnsupportedOpError
+from export_model.converters.files.fetch import read_bytes
+from export_model.converters.files.folders import scratch_folder
+from export_model.converters.formats.format import Port, Ports
+from export_model.converters.formats.intermediate_tensors import Feeds, InnerTensors, Loaded, RunAll, Sampler, View
+from export_model.converters.formats.litert.flatbuffer import Table, decode, encode
+from export_model.converters.formats.litert.schema import BUILTINS, OPERATOR_NAMES
+from export_model.converters.formats.litert.tensors import dims_of, dtype_of, entry_of, needed_operators
+from export_model.converters.formats.onnx.tensor_map import TENSORS_KEY, loads
+from export_model.signatures.contract import EMBEDDED
+from export_model.signatures.errors import UnsupportedOpError
 
 
 def ports(path: Path) -> Ports:

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from converters.files.chunks import Pieces
-from converters.formats.litert.schema import IDENTIFIER, OPTIONS, TABLES, Field
-from signatures.errors import DamagedFileError, TooLargeError
+from export_model.converters.files.chunks import Pieces
+from export_model.converters.formats.litert.schema import IDENTIFIER, OPTIONS, TABLES, Field
+from export_model.signatures.errors import DamagedFileError, TooLargeError
 
 Table = dict[str, Any]
 

@@ -12,10 +12,10 @@ from collections.abc import Mapping
 import numpy as np
 from msgspec import Struct
 
-from converters.formats.litert.artifact import operator_of
-from converters.formats.litert.flatbuffer import Table, decode
-from converters.formats.litert.tensors import dims_of, dtype_of, entry_of
-from converters.graph.types import INT32, INT64
+from export_model.converters.formats.litert.artifact import operator_of
+from export_model.converters.formats.litert.flatbuffer import Table, decode
+from export_model.converters.formats.litert.tensors import dims_of, dtype_of, entry_of
+from export_model.converters.graph.types import INT32, INT64
 
 VERSION = "tflite-micro 0.dev20261023182759"
 _OPERATORS = frozenset(

@@ -11,21 +11,21 @@ from collections.abc import Mapping
 import numpy as np
 from msgspec import Struct
 
-from converters.compiler.options import MAX_PORTS
-from converters.formats.bundle.embed import contract_of
-from converters.formats.litert.artifact import note, operator_of
-from converters.formats.litert.flatbuffer import Table, decode
-from converters.formats.litert.importer.importer import Importer
-from converters.formats.litert.importer.table import TABLE
-from converters.formats.litert.schema import VERSION
-from converters.formats.litert.tensors import Tensors, damaged_error, entry_of, needed_operators
-from converters.formats.onnx.tensor_map import TENSORS_KEY, loads
-from converters.formats.saved_model.signature import ModelSignature, Tensor
-from converters.graph.builder import MAX_NODES
-from converters.graph.nodes import Graph, TensorShape
-from converters.graph.types import INT64
-from signatures.contract import EMBEDDED, Contract
-from signatures.errors import NotAPolicyError
+from export_model.converters.compiler.options import MAX_PORTS
+from export_model.converters.formats.bundle.embed import contract_of
+from export_model.converters.formats.litert.artifact import note, operator_of
+from export_model.converters.formats.litert.flatbuffer import Table, decode
+from export_model.converters.formats.litert.importer.importer import Importer
+from export_model.converters.formats.litert.importer.table import TABLE
+from export_model.converters.formats.litert.schema import VERSION
+from export_model.converters.formats.litert.tensors import Tensors, damaged_error, entry_of, needed_operators
+from export_model.converters.formats.onnx.tensor_map import TENSORS_KEY, loads
+from export_model.converters.formats.saved_model.signature import ModelSignature, Tensor
+from export_model.converters.graph.builder import MAX_NODES
+from export_model.converters.graph.nodes import Graph, TensorShape
+from export_model.converters.graph.types import INT64
+from export_model.signatures.contract import EMBEDDED, Contract
+from export_model.signatures.errors import NotAPolicyError
 
 #: The signature that is read where a file has several, as TensorFlow calls the one of a model that is served.
 SERVING = "serving_default"

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from converters.files.fetch import Fetched
-from converters.formats.bundle.embed import facts_of, redrawn
-from converters.formats.litert.reader import LitertModel, read_litert
-from converters.formats.saved_model.signature import expose_signature
-from converters.formats.source import OriginalRun, ReadOptions, SourceModel
-from converters.graph.ops.table import traits
-from converters.policy.facts import DOUBLES_NARROWED
+from export_model.converters.files.fetch import Fetched
+from export_model.converters.formats.bundle.embed import facts_of, redrawn
+from export_model.converters.formats.litert.reader import LitertModel, read_litert
+from export_model.converters.formats.saved_model.signature import expose_signature
+from export_model.converters.formats.source import OriginalRun, ReadOptions, SourceModel
+from export_model.converters.graph.ops.table import traits
+from export_model.converters.policy.facts import DOUBLES_NARROWED
 
 
 def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:

@@ -9,20 +9,20 @@ from typing import Any
 import numpy as np
 from msgspec.structs import replace
 
-from converters.compiler.passes.weights import compact
-from converters.files.chunks import equal
-from converters.files.external_data import LARGE
-from converters.formats.format import WriteOptions
-from converters.formats.intermediate_tensors import View
-from converters.formats.litert.flatbuffer import Table
-from converters.formats.litert.schema import ACTIVATIONS, BUILTINS, OPTIONS, PADDINGS, TABLES, TYPES
-from converters.formats.litert.tensors import UNNAMED
-from converters.graph.nodes import Graph, NameScope, Node, ref
-from converters.graph.ops.litert.base import NONE, Value, emit_reshape, litert_error
-from converters.graph.ops.table import op_of
-from converters.graph.shapes import infer_types
-from converters.graph.types import BATCH, INT32, INT64, TensorType, of_array
-from signatures.spec import TensorSpec
+from export_model.converters.compiler.passes.weights import compact
+from export_model.converters.files.chunks import equal
+from export_model.converters.files.external_data import LARGE
+from export_model.converters.formats.format import WriteOptions
+from export_model.converters.formats.intermediate_tensors import View
+from export_model.converters.formats.litert.flatbuffer import Table
+from export_model.converters.formats.litert.schema import ACTIVATIONS, BUILTINS, OPTIONS, PADDINGS, TABLES, TYPES
+from export_model.converters.formats.litert.tensors import UNNAMED
+from export_model.converters.graph.nodes import Graph, NameScope, Node, ref
+from export_model.converters.graph.ops.litert.base import NONE, Value, emit_reshape, litert_error
+from export_model.converters.graph.ops.table import op_of
+from export_model.converters.graph.shapes import infer_types
+from export_model.converters.graph.types import BATCH, INT32, INT64, TensorType, of_array
+from export_model.signatures.spec import TensorSpec
 
 
 class Shared:
@@ -76,7 +76,7 @@ class Shared:
 
 
 class Subgraph:
-    """One function of a model (implements converters.graph.ops.litert.base.LitertBuilder)."""
+    """One function of a model (implements export_model.converters.graph.ops.litert.base.LitertBuilder)."""
 
     def __init__(self, graph: Graph, outputs: Iterable[str], shared: Shared, options: WriteOptions) -> None:
         self.graph, self.shared, self.storage, self.batch = graph, shared, options.weights, options.batch

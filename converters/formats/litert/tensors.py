@@ -9,10 +9,10 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from converters.formats.litert.flatbuffer import Table
-from converters.formats.litert.schema import TYPES
-from converters.graph.types import FLOAT32
-from signatures.errors import DamagedFileError, NotAPolicyError, UnsupportedOpError
+from export_model.converters.formats.litert.flatbuffer import Table
+from export_model.converters.formats.litert.schema import TYPES
+from export_model.converters.graph.types import FLOAT32
+from export_model.signatures.errors import DamagedFileError, NotAPolicyError, UnsupportedOpError
 
 _DTYPES = {number: dtype for dtype, (number, _) in TYPES.items()}
 #: What policies compute in: halves and doubles are computed as float32.

@@ -8,19 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from converters.compiler.targets import LITERT, prepare
-from converters.files.chunks import Pieces
-from converters.formats.format import WriteOptions
-from converters.formats.intermediate_tensors import View
-from converters.formats.litert.flatbuffer import Table, encode
-from converters.formats.litert.schema import VERSION
-from converters.formats.litert.subgraph import Shared, Subgraph
-from converters.formats.onnx.tensor_map import TENSORS_KEY, TensorMap
-from converters.formats.saved_model.writer import signatures_of
-from converters.graph.nodes import Graph
-from converters.policy.policy import Policy
-from signatures.contract import EMBEDDED
-from signatures.spec import TensorSpec
+from export_model.converters.compiler.targets import LITERT, prepare
+from export_model.converters.files.chunks import Pieces
+from export_model.converters.formats.format import WriteOptions
+from export_model.converters.formats.intermediate_tensors import View
+from export_model.converters.formats.litert.flatbuffer import Table, encode
+from export_model.converters.formats.litert.schema import VERSION
+from export_model.converters.formats.litert.subgraph import Shared, Subgraph
+from export_model.converters.formats.onnx.tensor_map import TENSORS_KEY, TensorMap
+from export_model.converters.formats.saved_model.writer import signatures_of
+from export_model.converters.graph.nodes import Graph
+from export_model.converters.policy.policy import Policy
+from export_model.signatures.contract import EMBEDDED
+from export_model.signatures.spec import TensorSpec
 
 
 def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:

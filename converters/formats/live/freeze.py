@@ -10,7 +10,7 @@ from typing import Any
 
 from msgspec import Struct
 
-from converters.graph.ops.table import FUNCTIONAL
+from export_model.converters.graph.ops.table import FUNCTIONAL
 
 TypedTensor = tuple[str, str, list[int | None] | None]
 

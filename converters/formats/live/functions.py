@@ -11,11 +11,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from converters.formats.frozen_graph.reader import read_graph
-from converters.formats.live.freeze import keras_call, keras_outputs, named_function, saved_function
-from converters.formats.saved_model.signature import expose_signature, signature_of
-from converters.formats.source import OriginalRun, SourceModel
-from signatures.errors import SourceError, UsageError
+from export_model.converters.formats.frozen_graph.reader import read_graph
+from export_model.converters.formats.live.freeze import keras_call, keras_outputs, named_function, saved_function
+from export_model.converters.formats.saved_model.signature import expose_signature, signature_of
+from export_model.converters.formats.source import OriginalRun, SourceModel
+from export_model.signatures.errors import SourceError, UsageError
 
 NAME = "policy"
 #: Names of functions that say nothing of a policy.

@@ -12,16 +12,16 @@ from typing import Any
 
 import numpy as np
 
-from converters.files import tensorflow_messages as schema
-from converters.formats.checkpoint.freeze import freeze, wanted_variables
-from converters.formats.checkpoint.policy_nodes import policy_nodes
-from converters.formats.checkpoint.tensor_bundle import Extents, several
-from converters.formats.checkpoint.training_graph import Saved, TrainingGraph, training_graph
-from converters.formats.live.freeze import flatten_graph
-from converters.formats.source import OriginalRun, SourceModel
-from converters.graph.ops.table import VARIABLES
-from converters.policy.facts import SourceFacts
-from signatures.errors import NotAPolicyError, SourceError, UsageError
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.formats.checkpoint.freeze import freeze, wanted_variables
+from export_model.converters.formats.checkpoint.policy_nodes import policy_nodes
+from export_model.converters.formats.checkpoint.tensor_bundle import Extents, several
+from export_model.converters.formats.checkpoint.training_graph import Saved, TrainingGraph, training_graph
+from export_model.converters.formats.live.freeze import flatten_graph
+from export_model.converters.formats.source import OriginalRun, SourceModel
+from export_model.converters.graph.ops.table import VARIABLES
+from export_model.converters.policy.facts import SourceFacts
+from export_model.signatures.errors import NotAPolicyError, SourceError, UsageError
 
 NAME = "policy"
 #: The values go by the graph's name: whoever is handed that is handed them, too.
@@ -29,7 +29,7 @@ _GRAPH, _VALUES = "graph.pb", "graph.pb.npz"
 
 
 class SessionValues:
-    """The values of variables by their nodes' names, as ``converters.formats.checkpoint.freeze`` takes them."""
+    """The values of variables by their nodes' names, as ``export_model.converters.formats.checkpoint.freeze`` takes them."""
 
     place = "live session"
 

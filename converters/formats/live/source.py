@@ -9,13 +9,13 @@ from typing import Any
 
 from msgspec import Struct
 
-from converters.formats.format import Format
-from converters.formats.live.functions import read_function, read_keras
-from converters.formats.live.session import read_session
-from converters.formats.source import SourceModel
-from converters.graph.nodes import Graph
-from signatures.digest import sha256_hex
-from signatures.errors import UsageError
+from export_model.converters.formats.format import Format
+from export_model.converters.formats.live.functions import read_function, read_keras
+from export_model.converters.formats.live.session import read_session
+from export_model.converters.formats.source import SourceModel
+from export_model.converters.graph.nodes import Graph
+from export_model.signatures.digest import sha256_hex
+from export_model.signatures.errors import UsageError
 
 _KINDS = {
     "session": (Format(key="session", label="a live session"), read_session),

@@ -12,18 +12,18 @@ from typing import Any
 
 import numpy as np
 
-from converters.files.external_data import Detached
-from converters.files.fetch import read_bytes
-from converters.files.folders import scratch_folder
-from converters.files.memory_mapped import Mapped
-from converters.formats.format import Port, Ports
-from converters.formats.intermediate_tensors import Feeds, InnerTensors, Loaded, RunAll, View
-from converters.formats.onnx.edit import cut, lift_draws, samplers_of
-from converters.formats.onnx.messages import files_of
-from converters.formats.onnx.proto import array_of, decode_model, dtype_name, load_external
-from converters.formats.onnx.tensor_map import TENSORS_KEY, loads
-from signatures.contract import EMBEDDED
-from signatures.spec import PolicySignature
+from export_model.converters.files.external_data import Detached
+from export_model.converters.files.fetch import read_bytes
+from export_model.converters.files.folders import scratch_folder
+from export_model.converters.files.memory_mapped import Mapped
+from export_model.converters.formats.format import Port, Ports
+from export_model.converters.formats.intermediate_tensors import Feeds, InnerTensors, Loaded, RunAll, View
+from export_model.converters.formats.onnx.edit import cut, lift_draws, samplers_of
+from export_model.converters.formats.onnx.messages import files_of
+from export_model.converters.formats.onnx.proto import array_of, decode_model, dtype_name, load_external
+from export_model.converters.formats.onnx.tensor_map import TENSORS_KEY, loads
+from export_model.signatures.contract import EMBEDDED
+from export_model.signatures.spec import PolicySignature
 
 
 def ports(path: Path) -> Ports:

@@ -15,14 +15,14 @@ from typing import Any
 import numpy as np
 from msgspec import Struct
 
-from converters.compiler.passes.vmap import for_every_row
-from converters.compiler.passes.vmap_trial import ROWS, check_rows, too_large
-from converters.formats.onnx.importer.importer import Importer
-from converters.formats.onnx.importer.node import DTYPES
-from converters.graph.nodes import Graph
-from converters.graph.shapes import Types, infer_types
-from converters.graph.size_limits import MAX_COMPUTED
-from signatures.errors import ExportModelError, NotAPolicyError, SignatureError
+from export_model.converters.compiler.passes.vmap import for_every_row
+from export_model.converters.compiler.passes.vmap_trial import ROWS, check_rows, too_large
+from export_model.converters.formats.onnx.importer.importer import Importer
+from export_model.converters.formats.onnx.importer.node import DTYPES
+from export_model.converters.graph.nodes import Graph
+from export_model.converters.graph.shapes import Types, infer_types
+from export_model.converters.graph.size_limits import MAX_COMPUTED
+from export_model.signatures.errors import ExportModelError, NotAPolicyError, SignatureError
 
 #: Numbers that a model with a fixed batch may take at a time (32 MiB).
 _MAX_FED = 1 << 23

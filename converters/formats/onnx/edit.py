@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from converters.formats.intermediate_tensors import Sampler
-from converters.formats.onnx.messages import node as new_node
-from converters.formats.onnx.messages import tensor, value_info
-from converters.graph.nodes import reachable
-from converters.graph.types import FLOAT32
+from export_model.converters.formats.intermediate_tensors import Sampler
+from export_model.converters.formats.onnx.messages import node as new_node
+from export_model.converters.formats.onnx.messages import tensor, value_info
+from export_model.converters.graph.nodes import reachable
+from export_model.converters.graph.types import FLOAT32
 
 _FLOAT, _INT = 1, 2  # AttributeProto.AttributeType; FLOAT is 1 in TensorProto.DataType too
 _INT64 = 7  # TensorProto.DataType

@@ -7,8 +7,8 @@ from typing import Any
 
 from msgspec import Struct
 
-from converters.formats.onnx.functions import all_nodes
-from signatures.errors import UsageError
+from export_model.converters.formats.onnx.functions import all_nodes
+from export_model.signatures.errors import UsageError
 
 
 class ExporterFault(Struct, frozen=True):

@@ -9,12 +9,12 @@ from typing import Any
 
 from msgspec import Struct, field
 
-from converters.formats.onnx.importer.node import STANDARD
-from converters.formats.onnx.importer.table import TABLE
-from converters.formats.onnx.messages import as_onnx_message
-from converters.formats.onnx.proto import bodies
-from converters.graph.builder import MAX_NODES
-from signatures.errors import DamagedFileError, UnsupportedOpError
+from export_model.converters.formats.onnx.importer.node import STANDARD
+from export_model.converters.formats.onnx.importer.table import TABLE
+from export_model.converters.formats.onnx.messages import as_onnx_message
+from export_model.converters.formats.onnx.proto import bodies
+from export_model.converters.graph.builder import MAX_NODES
+from export_model.signatures.errors import DamagedFileError, UnsupportedOpError
 
 #: Opsets that are read. Before 7 broadcasting was an attribute of each op.
 FIRST_OPSET = 7

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from converters.files.external_data import LARGE, Detached
-from converters.formats.onnx.proto import bodies, raw_of, tensors
-from signatures.errors import DamagedFileError
+from export_model.converters.files.external_data import LARGE, Detached
+from export_model.converters.formats.onnx.proto import bodies, raw_of, tensors
+from export_model.signatures.errors import DamagedFileError
 
 _FLOAT, _FLOAT16, _BFLOAT16 = 1, 10, 16  # TensorProto.DataType
 _HALVES = (_FLOAT16, _BFLOAT16)

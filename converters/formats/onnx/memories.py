@@ -13,9 +13,9 @@ from typing import Any
 
 from msgspec import Struct, field
 
-from converters.formats.onnx.importer.node import STANDARD
-from converters.policy.rules import Decision, Rule, always, first
-from signatures.roles import Role
+from export_model.converters.formats.onnx.importer.node import STANDARD
+from export_model.converters.policy.rules import Decision, Rule, always, first
+from export_model.signatures.roles import Role
 
 Dims = tuple[int | None, ...] | None
 

@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from converters.files.chunks import Pieces
-from converters.files.external_data import Detached, is_readable
-from converters.files.protobuf_messages import message_classes
-from signatures.dtypes import DATA_TYPES
-from signatures.errors import UnsupportedOpError
+from export_model.converters.files.chunks import Pieces
+from export_model.converters.files.external_data import Detached, is_readable
+from export_model.converters.files.protobuf_messages import message_classes
+from export_model.signatures.dtypes import DATA_TYPES
+from export_model.signatures.errors import UnsupportedOpError
 
 _CLASSES = message_classes(
     "export_model_onnx",

@@ -7,11 +7,11 @@ from collections.abc import Callable, Sequence
 
 from msgspec import Struct
 
-from converters.formats.onnx.reader import OnnxModel
-from converters.graph.types import Dim
-from converters.policy.action_values import is_q_name, is_scores
-from converters.policy.rules import Decision, Rule, against, first
-from signatures.roles import OUTPUT_NAMES, STATE_VALUE_NAMES, Role
+from export_model.converters.formats.onnx.reader import OnnxModel
+from export_model.converters.graph.types import Dim
+from export_model.converters.policy.action_values import is_q_name, is_scores
+from export_model.converters.policy.rules import Decision, Rule, against, first
+from export_model.signatures.roles import OUTPUT_NAMES, STATE_VALUE_NAMES, Role
 
 #: What other trainers call the action and the value: rsl_rl (actions), Stable-Baselines3, CleanRL, plain PyTorch.
 _ACTION = re.compile(r"actions?|act|action_mean|mean_actions?|action_logits|logits|outputs?|mean|mu|pi|policy")

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from converters.formats.onnx import messages
+from export_model.converters.formats.onnx import messages
 
 
 def simplify_nodes(

@@ -15,15 +15,15 @@ from typing import Any
 import numpy as np
 from google.protobuf.message import DecodeError
 
-from converters.files import fetch
-from converters.files.external_data import LARGE, LARGE_FILE, Detached, Fields
-from converters.files.fetch import MAX_WEIGHTS, read_bytes
-from converters.files.message_limits import check_size
-from converters.files.tensorflow_messages import check_nodes
-from converters.formats.onnx.messages import ModelProto
-from converters.graph.types import FLOAT32
-from signatures.dtypes import DATA_TYPES
-from signatures.errors import DamagedFileError, NotAPolicyError, UnsupportedOpError
+from export_model.converters.files import fetch
+from export_model.converters.files.external_data import LARGE, LARGE_FILE, Detached, Fields
+from export_model.converters.files.fetch import MAX_WEIGHTS, read_bytes
+from export_model.converters.files.message_limits import check_size
+from export_model.converters.files.tensorflow_messages import check_nodes
+from export_model.converters.formats.onnx.messages import ModelProto
+from export_model.converters.graph.types import FLOAT32
+from export_model.signatures.dtypes import DATA_TYPES
+from export_model.signatures.errors import DamagedFileError, NotAPolicyError, UnsupportedOpError
 
 _MAX_AXES, _MAX_ELEMENTS = 32, 1 << 31
 #: Messages of a file: nodes, attributes, types, axes. An empty one has two bytes, and takes a hundred in memory.

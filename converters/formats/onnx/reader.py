@@ -11,24 +11,24 @@ import numpy as np
 from msgspec import Struct, field
 from msgspec.structs import replace
 
-from converters.files.external_data import Detached
-from converters.files.fetch import Fetched
-from converters.formats.onnx.batch_axis import Reading, dims_of, read_rows
-from converters.formats.onnx.exporters import repair_model
-from converters.formats.onnx.functions import all_nodes, inline_functions, opsets_of
-from converters.formats.onnx.half_precision import widen
-from converters.formats.onnx.importer.importer import Importer, joined_errors
-from converters.formats.onnx.importer.node import DTYPES
-from converters.formats.onnx.importer.table import TABLE
-from converters.formats.onnx.memories import FoundMemories, OnnxMemory, separate_memories
-from converters.formats.onnx.proto import array_of, decode_model, load_external, tensors
-from converters.graph.nodes import Graph, TensorShape
-from converters.graph.types import BATCH, Dim, TensorType
-from converters.policy.memories import looks_like_state
-from converters.policy.rules import Decision
-from signatures.errors import DamagedFileError, NotAPolicyError, UnsupportedOpError
-from signatures.memories import SeparateMemory
-from signatures.roles import ACTION_NAMES, CONSTANT_NAMES
+from export_model.converters.files.external_data import Detached
+from export_model.converters.files.fetch import Fetched
+from export_model.converters.formats.onnx.batch_axis import Reading, dims_of, read_rows
+from export_model.converters.formats.onnx.exporters import repair_model
+from export_model.converters.formats.onnx.functions import all_nodes, inline_functions, opsets_of
+from export_model.converters.formats.onnx.half_precision import widen
+from export_model.converters.formats.onnx.importer.importer import Importer, joined_errors
+from export_model.converters.formats.onnx.importer.node import DTYPES
+from export_model.converters.formats.onnx.importer.table import TABLE
+from export_model.converters.formats.onnx.memories import FoundMemories, OnnxMemory, separate_memories
+from export_model.converters.formats.onnx.proto import array_of, decode_model, load_external, tensors
+from export_model.converters.graph.nodes import Graph, TensorShape
+from export_model.converters.graph.types import BATCH, Dim, TensorType
+from export_model.converters.policy.memories import looks_like_state
+from export_model.converters.policy.rules import Decision
+from export_model.signatures.errors import DamagedFileError, NotAPolicyError, UnsupportedOpError
+from export_model.signatures.memories import SeparateMemory
+from export_model.signatures.roles import ACTION_NAMES, CONSTANT_NAMES
 
 _FLOAT, _DOUBLE = 1, 11
 _INT = 2  # AttributeProto.AttributeType

@@ -6,11 +6,11 @@ from functools import partial
 
 from msgspec.structs import replace
 
-from converters.files.fetch import Fetched
-from converters.formats.onnx.reader import read_onnx
-from converters.formats.onnx.trainers import understand
-from converters.formats.onnx.vetted import safe_copy
-from converters.formats.source import OriginalRun, ReadOptions, SourceModel
+from export_model.converters.files.fetch import Fetched
+from export_model.converters.formats.onnx.reader import read_onnx
+from export_model.converters.formats.onnx.trainers import understand
+from export_model.converters.formats.onnx.vetted import safe_copy
+from export_model.converters.formats.source import OriginalRun, ReadOptions, SourceModel
 
 
 def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:

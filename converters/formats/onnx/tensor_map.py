@@ -14,8 +14,8 @@ from typing import Any
 
 from msgspec import Struct, field
 
-from converters.formats.intermediate_tensors import View
-from signatures import bounded
+from export_model.converters.formats.intermediate_tensors import View
+from export_model.signatures import bounded
 
 TENSORS_KEY = "export_model_tensors"
 

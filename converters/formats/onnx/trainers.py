@@ -12,19 +12,19 @@ from collections.abc import Mapping
 import numpy as np
 from msgspec.structs import replace
 
-from converters.formats.bundle.embed import contract_of, redrawn
-from converters.formats.bundle.embed import facts_of as facts_of_contract
-from converters.formats.onnx.output_roles import output_roles, positional
-from converters.formats.onnx.reader import OnnxModel
-from converters.formats.onnx.tensor_map import TENSORS_KEY
-from converters.graph.nodes import Graph, NameScope, Node, topological
-from converters.graph.ops.table import passes_on, traits
-from converters.interfaces.metadata import read_metadata
-from converters.policy.brains import depends_on_input
-from converters.policy.facts import DOUBLES_NARROWED, SourceFacts
-from converters.policy.generations import SAC_MEAN, torch_generation
-from signatures.contract import EMBEDDED
-from signatures.roles import CONSTANT_NAMES, TRAINER_VERSION, VERSION_NUMBER, Role
+from export_model.converters.formats.bundle.embed import contract_of, redrawn
+from export_model.converters.formats.bundle.embed import facts_of as facts_of_contract
+from export_model.converters.formats.onnx.output_roles import output_roles, positional
+from export_model.converters.formats.onnx.reader import OnnxModel
+from export_model.converters.formats.onnx.tensor_map import TENSORS_KEY
+from export_model.converters.graph.nodes import Graph, NameScope, Node, topological
+from export_model.converters.graph.ops.table import passes_on, traits
+from export_model.converters.interfaces.metadata import read_metadata
+from export_model.converters.policy.brains import depends_on_input
+from export_model.converters.policy.facts import DOUBLES_NARROWED, SourceFacts
+from export_model.converters.policy.generations import SAC_MEAN, torch_generation
+from export_model.signatures.contract import EMBEDDED
+from export_model.signatures.roles import CONSTANT_NAMES, TRAINER_VERSION, VERSION_NUMBER, Role
 
 #: What only policies (and critics) call their inputs and outputs.
 _OF_A_POLICY = re.compile(

@@ -12,12 +12,12 @@ from collections.abc import Sequence, Set
 from pathlib import Path
 from typing import Any
 
-from converters.files.external_data import Detached
-from converters.files.fetch import Fetched, read_bytes
-from converters.formats.onnx.exporters import repair_model
-from converters.formats.onnx.messages import files_of
-from converters.formats.onnx.proto import decode_model, inside, load_external
-from signatures.errors import UnsupportedOpError
+from export_model.converters.files.external_data import Detached
+from export_model.converters.files.fetch import Fetched, read_bytes
+from export_model.converters.formats.onnx.exporters import repair_model
+from export_model.converters.formats.onnx.messages import files_of
+from export_model.converters.formats.onnx.proto import decode_model, inside, load_external
+from export_model.signatures.errors import UnsupportedOpError
 
 #: Domains of ONNX, all of whose operators compute.
 _ONNX = frozenset(("", "ai.onnx", "ai.onnx.ml"))
@@ -84,7 +84,7 @@ def flat(path: Path, wanted: Sequence[str]) -> bytes:
     fails, and a loop of the model would have no end there. Raises what ``read_onnx`` raises, UnsupportedOpError where
     the file has functions or graphs inside: export-model writes none.
     """
-    from converters.formats.onnx.reader import read_onnx
+    from export_model.converters.formats.onnx.reader import read_onnx
 
     read_onnx(Fetched(path))
     model = self_contained_model(path)

@@ -13,25 +13,25 @@ from typing import Any
 
 import numpy as np
 
-from converters.compiler.passes.weights import Storage, compact
-from converters.compiler.targets import ONNX, consumer_onnx, prepare
-from converters.files.chunks import Pieces, equal
-from converters.files.external_data import LARGE, Detached
-from converters.formats.format import WriteOptions
-from converters.formats.intermediate_tensors import View
-from converters.formats.onnx import messages
-from converters.formats.onnx.artifact import stated_metadata
-from converters.formats.onnx.messages import files_of
-from converters.formats.onnx.peephole import pooled_first, simplify_nodes
-from converters.formats.onnx.tensor_map import TENSORS_KEY, TensorMap
-from converters.graph.nodes import Graph, NameScope, Node, ref
-from converters.graph.ops.table import op_of, unsupported_error
-from converters.graph.shapes import Types, infer_types
-from converters.graph.types import FLOAT32, TensorType
-from converters.policy.policy import Policy
-from signatures.contract import EMBEDDED
-from signatures.errors import GraphError, UsageError
-from signatures.spec import TensorSpec
+from export_model.converters.compiler.passes.weights import Storage, compact
+from export_model.converters.compiler.targets import ONNX, consumer_onnx, prepare
+from export_model.converters.files.chunks import Pieces, equal
+from export_model.converters.files.external_data import LARGE, Detached
+from export_model.converters.formats.format import WriteOptions
+from export_model.converters.formats.intermediate_tensors import View
+from export_model.converters.formats.onnx import messages
+from export_model.converters.formats.onnx.artifact import stated_metadata
+from export_model.converters.formats.onnx.messages import files_of
+from export_model.converters.formats.onnx.peephole import pooled_first, simplify_nodes
+from export_model.converters.formats.onnx.tensor_map import TENSORS_KEY, TensorMap
+from export_model.converters.graph.nodes import Graph, NameScope, Node, ref
+from export_model.converters.graph.ops.table import op_of, unsupported_error
+from export_model.converters.graph.shapes import Types, infer_types
+from export_model.converters.graph.types import FLOAT32, TensorType
+from export_model.converters.policy.policy import Policy
+from export_model.signatures.contract import EMBEDDED
+from export_model.signatures.errors import GraphError, UsageError
+from export_model.signatures.spec import TensorSpec
 
 #: Opset → the IR version of the same ONNX release (onnx/helper.py, OP_SET_ID_VERSION_MAP).
 IR_VERSIONS = {11: 6, 12: 7, 13: 7, 14: 7, 15: 8, 16: 8, 17: 8, 18: 8, 19: 9, 20: 9, 21: 10}
@@ -48,7 +48,7 @@ PRODUCER = "export-model"
 
 
 class _Builder:
-    """The nodes and initializers of a model in the making (implements converters.graph.ops.base.OnnxBuilder)."""
+    """The nodes and initializers of a model in the making (implements export_model.converters.graph.ops.base.OnnxBuilder)."""
 
     def __init__(self, graph: Graph, opset: int, outputs: Collection[str]) -> None:
         self.opset = opset

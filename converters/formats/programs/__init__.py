@@ -6,14 +6,14 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import TYPE_CHECKING
 
-from converters.formats.format import Format, WriteOptions, defer_imports
-from signatures.code import WEIGHTS_FILE
+from export_model.converters.formats.format import Format, WriteOptions, defer_imports
+from export_model.signatures.code import WEIGHTS_FILE
 
 if TYPE_CHECKING:
-    from converters.files.chunks import Pieces
-    from converters.formats.programs import artifact as _artifact
-    from converters.formats.programs import members as _members
-    from converters.policy.policy import Policy
+    from export_model.converters.files.chunks import Pieces
+    from export_model.converters.formats.programs import artifact as _artifact
+    from export_model.converters.formats.programs import members as _members
+    from export_model.converters.policy.policy import Policy
 else:
     _artifact, _members = defer_imports(__name__, "artifact", "members")
 

@@ -6,17 +6,17 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
-from converters.files.children.confinement import in_force
-from converters.files.fetch import read_bytes
-from converters.files.file_probe import Content
-from converters.formats.format import Port, Ports
-from converters.formats.programs.comment import LINE, interface_lines
-from converters.formats.programs.members import answers
-from converters.formats.programs.weights import weights_name
-from signatures.code import CodeOptions
-from signatures.contract import EMBEDDED, Contract, json_of, parse
-from signatures.errors import DamagedFileError, UnsupportedOpError
-from signatures.spec import PolicySignature
+from export_model.converters.files.children.confinement import in_force
+from export_model.converters.files.fetch import read_bytes
+from export_model.converters.files.file_probe import Content
+from export_model.converters.formats.format import Port, Ports
+from export_model.converters.formats.programs.comment import LINE, interface_lines
+from export_model.converters.formats.programs.members import answers
+from export_model.converters.formats.programs.weights import weights_name
+from export_model.signatures.code import CodeOptions
+from export_model.signatures.contract import EMBEDDED, Contract, json_of, parse
+from export_model.signatures.errors import DamagedFileError, UnsupportedOpError
+from export_model.signatures.spec import PolicySignature
 
 #: What a file's ending says of its format.
 WRITTEN_AS = {".h": "c", ".cs": "csharp", ".mjs": "js"}

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 
-from converters.interfaces.text import ALL, loop_lines, term_lines
-from signatures.spec import PolicySignature
+from export_model.converters.interfaces.text import ALL, loop_lines, term_lines
+from export_model.signatures.spec import PolicySignature
 
 #: Begins a line of what is stated.
 LINE = "   | "

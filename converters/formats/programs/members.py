@@ -6,12 +6,12 @@ from collections.abc import Iterable, Sequence
 
 from msgspec import Struct
 
-from converters.graph.language import identifier, in_comment
-from converters.graph.nodes import NameScope
-from signatures.code import CodeOptions
-from signatures.errors import UnsupportedOpError
-from signatures.roles import Role
-from signatures.spec import PolicySignature, TensorSpec
+from export_model.converters.graph.language import identifier, in_comment
+from export_model.converters.graph.nodes import NameScope
+from export_model.signatures.code import CodeOptions
+from export_model.signatures.errors import UnsupportedOpError
+from export_model.signatures.roles import Role
+from export_model.signatures.spec import PolicySignature, TensorSpec
 
 #: What the actor does not need.
 _REST = frozenset((Role.VALUE, Role.ACTION_PROBS, Role.LOG_PROB, Role.STD, Role.LOG_STD))

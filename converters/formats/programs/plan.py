@@ -7,23 +7,23 @@ from collections.abc import Callable
 import numpy as np
 from msgspec import Struct
 
-from converters.compiler.targets import PROGRAM, prepare
-from converters.files.chunks import Pieces
-from converters.formats.format import WriteOptions
-from converters.formats.programs.comment import escape, interface_lines
-from converters.formats.programs.members import Field, Header, header_of
-from converters.formats.programs.weights import Weights, weights_name, weights_of
-from converters.graph.ops.table import traits
-from converters.graph.printer import Printer
-from converters.graph.program import Program, program_of
-from converters.graph.run import run_graph
-from converters.graph.shapes import numbers_made
-from converters.graph.size_limits import MAX_COMPUTED
-from converters.policy.policy import Policy
-from signatures.code import CodeOptions
-from signatures.contract import EMBEDDED
-from signatures.errors import GraphError, UnsupportedOpError, UsageError
-from signatures.roles import Role
+from export_model.converters.compiler.targets import PROGRAM, prepare
+from export_model.converters.files.chunks import Pieces
+from export_model.converters.formats.format import WriteOptions
+from export_model.converters.formats.programs.comment import escape, interface_lines
+from export_model.converters.formats.programs.members import Field, Header, header_of
+from export_model.converters.formats.programs.weights import Weights, weights_name, weights_of
+from export_model.converters.graph.ops.table import traits
+from export_model.converters.graph.printer import Printer
+from export_model.converters.graph.program import Program, program_of
+from export_model.converters.graph.run import run_graph
+from export_model.converters.graph.shapes import numbers_made
+from export_model.converters.graph.size_limits import MAX_COMPUTED
+from export_model.converters.policy.policy import Policy
+from export_model.signatures.code import CodeOptions
+from export_model.signatures.contract import EMBEDDED
+from export_model.signatures.errors import GraphError, UnsupportedOpError, UsageError
+from export_model.signatures.roles import Role
 
 #: Golden rows of the self test, and how far float32 may be off.
 ROWS = 3

@@ -13,11 +13,11 @@ import numpy as np
 from msgspec import Struct, field
 from msgspec.structs import replace
 
-from converters.compiler.passes.weights import Storage, compact
-from converters.graph.ops.loops.base import Element, Expression, Tensor, apply, number
-from converters.graph.program import Place, Program, elements, inline_scalars
-from converters.graph.types import BOOL, FLOAT32, INT64
-from signatures.code import WEIGHTS_FILE
+from export_model.converters.compiler.passes.weights import Storage, compact
+from export_model.converters.graph.ops.loops.base import Element, Expression, Tensor, apply, number
+from export_model.converters.graph.program import Place, Program, elements, inline_scalars
+from export_model.converters.graph.types import BOOL, FLOAT32, INT64
+from export_model.signatures.code import WEIGHTS_FILE
 
 #: dtypes of constants that stay in the source: each language holds them in its own way.
 _IN_SOURCE = (BOOL, INT64)

@@ -11,14 +11,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from converters.files.fetch import Fetched
-from converters.files.pickled_objects import array_of, unpickle_objects
-from converters.formats.format import Member
-from converters.formats.source import ReadOptions, SourceModel
-from converters.trainers.pytorch.weights import ArraysByName
-from converters.trainers.registry import rebuild
-from converters.trainers.trainer import Saved
-from signatures.errors import DamagedFileError, SourceError
+from export_model.converters.files.fetch import Fetched
+from export_model.converters.files.pickled_objects import array_of, unpickle_objects
+from export_model.converters.formats.format import Member
+from export_model.converters.formats.source import ReadOptions, SourceModel
+from export_model.converters.trainers.pytorch.weights import ArraysByName
+from export_model.converters.trainers.registry import rebuild
+from export_model.converters.trainers.trainer import Saved
+from export_model.signatures.errors import DamagedFileError, SourceError
 
 _STATE, _ARGUMENTS = "module_state.pkl", "class_and_ctor_args.pkl"
 _MODULES = (Path("learner_group/learner/rl_module"), Path("learner/rl_module"), Path("rl_module"), Path())

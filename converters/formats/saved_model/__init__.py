@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from converters.formats.format import Format, defer_imports
+from export_model.converters.formats.format import Format, defer_imports
 
 if TYPE_CHECKING:
-    from converters.files.file_probe import Content
-    from converters.formats.saved_model import artifact as _artifact
-    from converters.formats.saved_model import source as _source
-    from converters.formats.saved_model import vetted as _vetted
-    from converters.formats.saved_model import writer as _writer
+    from export_model.converters.files.file_probe import Content
+    from export_model.converters.formats.saved_model import artifact as _artifact
+    from export_model.converters.formats.saved_model import source as _source
+    from export_model.converters.formats.saved_model import vetted as _vetted
+    from export_model.converters.formats.saved_model import writer as _writer
 else:
     _artifact, _source, _vetted, _writer = defer_imports(__name__, "artifact", "source", "vetted", "writer")
 

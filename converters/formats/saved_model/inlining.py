@@ -12,11 +12,20 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
-from converters.files import tensorflow_messages as schema
-from converters.formats.frozen_graph.subgraph import COMPUTING, is_pivot
-from converters.graph.nodes import NameScope, Node, normal_ref, reachable, ref, renamed_ref, split_ref
-from converters.graph.ops.table import CALLING, EFFECTS, IFS, ORDERING, READS, RESULTS, WHILES, unsupported_error
-from signatures.errors import DamagedFileError, NotAPolicyError
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.formats.frozen_graph.subgraph import COMPUTING, is_pivot
+from export_model.converters.graph.nodes import NameScope, Node, normal_ref, reachable, ref, renamed_ref, split_ref
+from export_model.converters.graph.ops.table import (
+    CALLING,
+    EFFECTS,
+    IFS,
+    ORDERING,
+    READS,
+    RESULTS,
+    WHILES,
+    unsupported_error,
+)
+from export_model.signatures.errors import DamagedFileError, NotAPolicyError
 
 _ALLOWED = COMPUTING | READS | ORDERING | CALLING
 _BOOL = 10  # DataType

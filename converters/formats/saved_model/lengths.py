@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from msgspec.structs import replace
 
-from converters.files.tensorflow_messages import dtype_number, node_def
-from converters.formats.frozen_graph.tensors import constant
-from converters.formats.saved_model.signature import ModelSignature
-from converters.graph.nodes import node_of, normal_ref
+from export_model.converters.files.tensorflow_messages import dtype_number, node_def
+from export_model.converters.formats.frozen_graph.tensors import constant
+from export_model.converters.formats.saved_model.signature import ModelSignature
+from export_model.converters.graph.nodes import node_of, normal_ref
 
 _INT32 = np.dtype(np.int32)
 

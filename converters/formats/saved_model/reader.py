@@ -11,13 +11,13 @@ from typing import Any
 
 from msgspec import Struct, field
 
-from converters.compiler.options import MAX_PORTS
-from converters.files import tensorflow_messages as schema
-from converters.files.external_data import Detached
-from converters.formats.saved_model.signature import ModelSignature, Tensor
-from converters.graph.nodes import TensorShape, node_of, reachable
-from converters.graph.ops.table import CALLING
-from signatures.errors import DamagedFileError, NotAPolicyError
+from export_model.converters.compiler.options import MAX_PORTS
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.files.external_data import Detached
+from export_model.converters.formats.saved_model.signature import ModelSignature, Tensor
+from export_model.converters.graph.nodes import TensorShape, node_of, reachable
+from export_model.converters.graph.ops.table import CALLING
+from export_model.signatures.errors import DamagedFileError, NotAPolicyError
 
 SERVING = "serving_default"
 _INIT = "__saved_model_"

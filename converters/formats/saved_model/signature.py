@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from msgspec import Struct, field
 
-from converters.compiler.options import MAX_PORTS
-from converters.files.tensorflow_messages import dtype_number
-from converters.formats.format import Port
-from converters.graph.nodes import (
+from export_model.converters.compiler.options import MAX_PORTS
+from export_model.converters.files.tensorflow_messages import dtype_number
+from export_model.converters.formats.format import Port
+from export_model.converters.graph.nodes import (
     Graph,
     NameScope,
     Node,
@@ -29,17 +29,17 @@ from converters.graph.nodes import (
     split_ref,
     topological,
 )
-from converters.graph.ops.table import is_fed
-from converters.graph.types import Symbols, TensorType
-from converters.policy.action_values import is_q_name
-from converters.policy.facts import SourceFacts
-from converters.policy.inputs import role_by_name
-from converters.policy.memories import float_rows, paired_memories
-from signatures.contract import EMBEDDED
-from signatures.dtypes import DATA_TYPES
-from signatures.errors import DamagedFileError, NotAPolicyError
-from signatures.memories import SeparateMemory
-from signatures.roles import ACTION_NAMES, CANONICAL, CONSTANT_NAMES, OUTPUT_NAMES, Role
+from export_model.converters.graph.ops.table import is_fed
+from export_model.converters.graph.types import Symbols, TensorType
+from export_model.converters.policy.action_values import is_q_name
+from export_model.converters.policy.facts import SourceFacts
+from export_model.converters.policy.inputs import role_by_name
+from export_model.converters.policy.memories import float_rows, paired_memories
+from export_model.signatures.contract import EMBEDDED
+from export_model.signatures.dtypes import DATA_TYPES
+from export_model.signatures.errors import DamagedFileError, NotAPolicyError
+from export_model.signatures.memories import SeparateMemory
+from export_model.signatures.roles import ACTION_NAMES, CANONICAL, CONSTANT_NAMES, OUTPUT_NAMES, Role
 
 _Q_VALUES = CANONICAL[Role.Q_VALUES]
 #: TensorFlow's names of dtypes that numpy knows by the same.

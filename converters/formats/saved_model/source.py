@@ -8,23 +8,23 @@ from typing import Any
 from msgspec import Struct
 from msgspec.structs import replace
 
-from converters.compiler.passes.unjoined_products import rejoin_biases
-from converters.files.fetch import Fetched, read_bytes
-from converters.files.file_probe import Content
-from converters.formats.bundle.embed import contract_text, facts_of, split_contract
-from converters.formats.checkpoint.freeze import freeze, with_values
-from converters.formats.checkpoint.tensor_bundle import Checkpoint
-from converters.formats.checkpoint.training_graph import Saved as Place
-from converters.formats.checkpoint.training_graph import TrainingGraph, saved_places, training_graph
-from converters.formats.frozen_graph.reader import from_graph_def
-from converters.formats.frozen_graph.source import read as read_frozen
-from converters.formats.saved_model.inlining import flat
-from converters.formats.saved_model.lengths import without_counted
-from converters.formats.saved_model.reader import Saved, read_saved_model
-from converters.formats.saved_model.signature import ModelSignature, expose_signature, fed_by_signature
-from converters.formats.source import OriginalRun, ReadOptions, SourceModel
-from converters.graph.nodes import Graph, node_of
-from signatures.errors import NotAPolicyError
+from export_model.converters.compiler.passes.unjoined_products import rejoin_biases
+from export_model.converters.files.fetch import Fetched, read_bytes
+from export_model.converters.files.file_probe import Content
+from export_model.converters.formats.bundle.embed import contract_text, facts_of, split_contract
+from export_model.converters.formats.checkpoint.freeze import freeze, with_values
+from export_model.converters.formats.checkpoint.tensor_bundle import Checkpoint
+from export_model.converters.formats.checkpoint.training_graph import Saved as Place
+from export_model.converters.formats.checkpoint.training_graph import TrainingGraph, saved_places, training_graph
+from export_model.converters.formats.frozen_graph.reader import from_graph_def
+from export_model.converters.formats.frozen_graph.source import read as read_frozen
+from export_model.converters.formats.saved_model.inlining import flat
+from export_model.converters.formats.saved_model.lengths import without_counted
+from export_model.converters.formats.saved_model.reader import Saved, read_saved_model
+from export_model.converters.formats.saved_model.signature import ModelSignature, expose_signature, fed_by_signature
+from export_model.converters.formats.source import OriginalRun, ReadOptions, SourceModel
+from export_model.converters.graph.nodes import Graph, node_of
+from export_model.signatures.errors import NotAPolicyError
 
 FILE = "saved_model.pb"
 _WITHOUT_VARIABLES = (

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from converters.files import tensorflow_messages as schema
-from converters.files.chunks import Pieces
-from converters.files.external_data import Detached, is_readable
-from converters.formats.frozen_graph.tensors import constant
-from converters.graph.nodes import NameScope
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.files.chunks import Pieces
+from export_model.converters.files.external_data import Detached, is_readable
+from export_model.converters.formats.frozen_graph.tensors import constant
+from export_model.converters.graph.nodes import NameScope
 
 _VERSION_2 = 2  # SaverDef.CheckpointFormatVersion
 
@@ -27,7 +27,9 @@ def files_of(message: Any, detached: Detached, unique: str) -> dict[str, Pieces]
     whole = schema.pieces(message, detached)
     if is_readable(whole):
         return {"saved_model.pb": whole}
-    from converters.formats.checkpoint.write import checkpoint  # no other policy needs a checkpoint's tables
+    from export_model.converters.formats.checkpoint.write import (
+        checkpoint,  # no other policy needs a checkpoint's tables
+    )
 
     (meta,) = message.meta_graphs
     values = _variables(meta, detached, unique)

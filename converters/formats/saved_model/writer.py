@@ -11,22 +11,22 @@ from typing import Any
 
 import numpy as np
 
-from converters.compiler.passes.weights import store_compactly
-from converters.compiler.targets import SAVED_MODEL, prepare
-from converters.files import tensorflow_messages as schema
-from converters.files.chunks import Pieces
-from converters.files.external_data import Detached, is_readable
-from converters.formats.bundle.embed import with_contract
-from converters.formats.format import WriteOptions
-from converters.formats.frozen_graph.encode import encode
-from converters.formats.frozen_graph.writer import serialise_graph
-from converters.formats.saved_model.variables import files_of
-from converters.graph.nodes import node_of
-from converters.graph.ops.samplers import SAMPLERS
-from converters.policy.policy import Policy
-from signatures.digest import sha256_hex
-from signatures.roles import Role
-from signatures.spec import TensorSpec
+from export_model.converters.compiler.passes.weights import store_compactly
+from export_model.converters.compiler.targets import SAVED_MODEL, prepare
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.files.chunks import Pieces
+from export_model.converters.files.external_data import Detached, is_readable
+from export_model.converters.formats.bundle.embed import with_contract
+from export_model.converters.formats.format import WriteOptions
+from export_model.converters.formats.frozen_graph.encode import encode
+from export_model.converters.formats.frozen_graph.writer import serialise_graph
+from export_model.converters.formats.saved_model.variables import files_of
+from export_model.converters.graph.nodes import node_of
+from export_model.converters.graph.ops.samplers import SAMPLERS
+from export_model.converters.policy.policy import Policy
+from export_model.signatures.digest import sha256_hex
+from export_model.signatures.roles import Role
+from export_model.signatures.spec import TensorSpec
 
 FOLDER = "saved_model"
 SERVING, DETERMINISTIC = "serving_default", "deterministic"

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from converters.formats.format import Format, defer_imports
+from export_model.converters.formats.format import Format, defer_imports
 
 if TYPE_CHECKING:
-    from converters.formats.stable_baselines3 import run_folder as _run_folder
-    from converters.formats.stable_baselines3 import source as _source
+    from export_model.converters.formats.stable_baselines3 import run_folder as _run_folder
+    from export_model.converters.formats.stable_baselines3 import source as _source
 else:
     _run_folder, _source = defer_imports(__name__, "run_folder", "source")
 

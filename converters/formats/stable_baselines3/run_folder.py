@@ -13,10 +13,10 @@ import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from converters.files.fetch import Fetched, path_text, unreadable
-from converters.formats.format import Member
-from converters.formats.source import ReadOptions
-from signatures.errors import SourceError
+from export_model.converters.files.fetch import Fetched, path_text, unreadable
+from export_model.converters.formats.format import Member
+from export_model.converters.formats.source import ReadOptions
+from export_model.signatures.errors import SourceError
 
 _STATISTICS = ("vecnormalize.pkl", "vec_normalize.pkl")
 #: What people call them, too.

@@ -13,16 +13,16 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from converters.files.fetch import Fetched, path_text
-from converters.files.file_probe import json_in
-from converters.files.torch_archive import Archive
-from converters.files.zip_archives import ZIP_ERRORS, entry_of, open_archive
-from converters.formats.source import NO_NORMALISER, ReadOptions, SourceModel
-from converters.formats.stable_baselines3.run_folder import settings_that_normalise, statistics_beside
-from converters.trainers.pytorch.weights import ArraysByName
-from converters.trainers.registry import rebuild
-from converters.trainers.trainer import Saved
-from signatures.errors import DamagedFileError
+from export_model.converters.files.fetch import Fetched, path_text
+from export_model.converters.files.file_probe import json_in
+from export_model.converters.files.torch_archive import Archive
+from export_model.converters.files.zip_archives import ZIP_ERRORS, entry_of, open_archive
+from export_model.converters.formats.source import NO_NORMALISER, ReadOptions, SourceModel
+from export_model.converters.formats.stable_baselines3.run_folder import settings_that_normalise, statistics_beside
+from export_model.converters.trainers.pytorch.weights import ArraysByName
+from export_model.converters.trainers.registry import rebuild
+from export_model.converters.trainers.trainer import Saved
+from export_model.signatures.errors import DamagedFileError
 
 _DATA, _POLICY = "data", "policy.pth"
 #: Stable-Baselines3 does not compress; a ZIP that was packed again shrinks JSON to a tenth, weights hardly.

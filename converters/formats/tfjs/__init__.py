@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from converters.formats.format import Format, defer_imports
+from export_model.converters.formats.format import Format, defer_imports
 
 if TYPE_CHECKING:
-    from converters.formats.tfjs import artifact as _artifact
-    from converters.formats.tfjs import reader as _reader
-    from converters.formats.tfjs import source as _source
-    from converters.formats.tfjs import split_graph as _split_graph
-    from converters.formats.tfjs import writer as _writer
+    from export_model.converters.formats.tfjs import artifact as _artifact
+    from export_model.converters.formats.tfjs import reader as _reader
+    from export_model.converters.formats.tfjs import source as _source
+    from export_model.converters.formats.tfjs import split_graph as _split_graph
+    from export_model.converters.formats.tfjs import writer as _writer
 else:
     _artifact, _reader, _source, _split_graph, _writer = defer_imports(
         __name__, "artifact", "reader", "source", "split_graph", "writer"

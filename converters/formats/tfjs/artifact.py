@@ -15,16 +15,16 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
-from converters.files.fetch import MAX_BYTES, read_bytes
-from converters.files.file_probe import json_in
-from converters.files.folders import scratch_folder
-from converters.formats.format import Port, Ports
-from converters.formats.frozen_graph.subgraph import COMPUTING
-from converters.formats.intermediate_tensors import InnerTensors, Loaded, RunAll, own_names, samplers_of
-from converters.formats.tfjs.reader import MODEL, read_signature, shard
-from converters.graph.nodes import Node
-from converters.graph.ops.table import CALLING, ORDERING, unsupported_error
-from signatures.errors import DamagedFileError
+from export_model.converters.files.fetch import MAX_BYTES, read_bytes
+from export_model.converters.files.file_probe import json_in
+from export_model.converters.files.folders import scratch_folder
+from export_model.converters.formats.format import Port, Ports
+from export_model.converters.formats.frozen_graph.subgraph import COMPUTING
+from export_model.converters.formats.intermediate_tensors import InnerTensors, Loaded, RunAll, own_names, samplers_of
+from export_model.converters.formats.tfjs.reader import MODEL, read_signature, shard
+from export_model.converters.graph.nodes import Node
+from export_model.converters.graph.ops.table import CALLING, ORDERING, unsupported_error
+from export_model.signatures.errors import DamagedFileError
 
 
 def ports(path: Path) -> Ports:

@@ -18,13 +18,13 @@ from typing import Any
 import numpy as np
 from msgspec import Struct
 
-from converters.files import tensorflow_messages as schema
-from converters.files.fetch import Fetched, inside, read_bytes
-from converters.files.file_probe import json_in
-from converters.formats.saved_model.signature import ModelSignature, Tensor
-from converters.graph.nodes import Graph, Node, TensorShape, normal_ref, topological
-from converters.graph.ops.table import IFS, WHILES, is_fed
-from signatures.errors import DamagedFileError, NotAPolicyError, SourceError
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.files.fetch import Fetched, inside, read_bytes
+from export_model.converters.files.file_probe import json_in
+from export_model.converters.formats.saved_model.signature import ModelSignature, Tensor
+from export_model.converters.graph.nodes import Graph, Node, TensorShape, normal_ref, topological
+from export_model.converters.graph.ops.table import IFS, WHILES, is_fed
+from export_model.signatures.errors import DamagedFileError, NotAPolicyError, SourceError
 
 MODEL = "model.json"
 _NAMES = ("float32", "int32", "bool", "uint8", "uint16", "float16", "int64")

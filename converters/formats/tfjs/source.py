@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 from msgspec.structs import replace
 
-from converters.compiler.passes.int8_products import join_products
-from converters.files.fetch import Fetched
-from converters.formats.bundle.embed import contract_of, facts_of, redrawn
-from converters.formats.saved_model.signature import expose_signature
-from converters.formats.source import ReadOptions, SourceModel
-from converters.formats.tfjs.reader import content_of, model_file, read_model, weights_of
-from converters.formats.tfjs.unfuse import unfuse
-from converters.graph.nodes import Graph, NameScope, Node, topological
-from signatures.contract import Contract
+from export_model.converters.compiler.passes.int8_products import join_products
+from export_model.converters.files.fetch import Fetched
+from export_model.converters.formats.bundle.embed import contract_of, facts_of, redrawn
+from export_model.converters.formats.saved_model.signature import expose_signature
+from export_model.converters.formats.source import ReadOptions, SourceModel
+from export_model.converters.formats.tfjs.reader import content_of, model_file, read_model, weights_of
+from export_model.converters.formats.tfjs.unfuse import unfuse
+from export_model.converters.graph.nodes import Graph, NameScope, Node, topological
+from export_model.signatures.contract import Contract
 
 
 def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
@@ -36,8 +36,8 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
 
 def _read_layers_model(content: Mapping[str, Any], given: Fetched) -> SourceModel:
     """A layers model: Keras' layers, and weights under their names."""
-    from converters.formats.keras.source import of_web_model
-    from converters.formats.keras.weights import Listed
+    from export_model.converters.formats.keras.source import of_web_model
+    from export_model.converters.formats.keras.weights import Listed
 
     file = model_file(given.path)
     weights, shards = weights_of(content.get("weightsManifest") or [], given, file.parent)

@@ -15,15 +15,15 @@ from typing import Any
 
 import numpy as np
 
-from converters.files import tensorflow_messages as schema
-from converters.files.external_data import Detached
-from converters.files.fetch import Fetched, read_bytes
-from converters.files.file_probe import Content, json_in
-from converters.formats.frozen_graph.reader import from_graph_def
-from converters.formats.frozen_graph.tensors import from_array, lacks_values
-from converters.formats.source import OriginalRun, ReadOptions, SourceModel
-from converters.formats.tfjs.reader import reshape_constant, weights_of
-from signatures.errors import DamagedFileError, ExportModelError, SourceError
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.files.external_data import Detached
+from export_model.converters.files.fetch import Fetched, read_bytes
+from export_model.converters.files.file_probe import Content, json_in
+from export_model.converters.formats.frozen_graph.reader import from_graph_def
+from export_model.converters.formats.frozen_graph.tensors import from_array, lacks_values
+from export_model.converters.formats.source import OriginalRun, ReadOptions, SourceModel
+from export_model.converters.formats.tfjs.reader import reshape_constant, weights_of
+from export_model.signatures.errors import DamagedFileError, ExportModelError, SourceError
 
 GRAPH, MANIFEST = "tensorflowjs_model.pb", "weights_manifest.json"
 _FIX = f"give the folder with the graph ({GRAPH}), {MANIFEST} and all the shards that it names"

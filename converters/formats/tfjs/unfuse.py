@@ -6,11 +6,11 @@ after it: BiasAdd, then an activation. ``Prelu`` has its slopes as a further inp
 
 from __future__ import annotations
 
-from converters.graph.editor import Editor
-from converters.graph.nn.activations import leaky_relu, prelu
-from converters.graph.nodes import Graph, Node
-from converters.graph.ops.table import TABLE
-from signatures.errors import GraphError, UnsupportedOpError
+from export_model.converters.graph.editor import Editor
+from export_model.converters.graph.nn.activations import leaky_relu, prelu
+from export_model.converters.graph.nodes import Graph, Node
+from export_model.converters.graph.ops.table import TABLE
+from export_model.signatures.errors import GraphError, UnsupportedOpError
 
 _PLAIN = {
     **{op.fused: op.name for op in TABLE.values() if op.fused},

@@ -22,19 +22,19 @@ from typing import Any
 
 import numpy as np
 
-from converters.compiler.passes.weights import Storage, are_steps, compact
-from converters.compiler.targets import TFJS, TFJS_INT8, prepare
-from converters.files import tensorflow_messages as schema
-from converters.files.chunks import Pieces
-from converters.formats.format import WriteOptions
-from converters.formats.frozen_graph.encode import PRODUCER, attributes
-from converters.graph.nodes import Graph, Node
-from converters.graph.ops.base import AttrKind
-from converters.graph.shapes import infer_types
-from converters.graph.types import FLOAT32, INT32
-from converters.policy.policy import Policy
-from signatures.errors import UnsupportedOpError
-from signatures.spec import TensorSpec
+from export_model.converters.compiler.passes.weights import Storage, are_steps, compact
+from export_model.converters.compiler.targets import TFJS, TFJS_INT8, prepare
+from export_model.converters.files import tensorflow_messages as schema
+from export_model.converters.files.chunks import Pieces
+from export_model.converters.formats.format import WriteOptions
+from export_model.converters.formats.frozen_graph.encode import PRODUCER, attributes
+from export_model.converters.graph.nodes import Graph, Node
+from export_model.converters.graph.ops.base import AttrKind
+from export_model.converters.graph.shapes import infer_types
+from export_model.converters.graph.types import FLOAT32, INT32
+from export_model.converters.policy.policy import Policy
+from export_model.signatures.errors import UnsupportedOpError
+from export_model.signatures.spec import TensorSpec
 
 SHARD_BYTES = 4 << 20
 #: The module that acts with the model in a page, and its types; they lie beside it.

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from converters.files.fetch import Fetched
-from converters.files.torch_archive import Archive
-from converters.formats.source import ReadOptions, SourceModel
-from converters.trainers.registry import rebuild
-from converters.trainers.trainer import Saved
+from export_model.converters.files.fetch import Fetched
+from export_model.converters.files.torch_archive import Archive
+from export_model.converters.formats.source import ReadOptions, SourceModel
+from export_model.converters.trainers.registry import rebuild
+from export_model.converters.trainers.trainer import Saved
 
 
 def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:

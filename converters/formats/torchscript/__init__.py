@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from converters.formats.format import Format, defer_imports
+from export_model.converters.formats.format import Format, defer_imports
 
 if TYPE_CHECKING:
-    from converters.files.file_probe import Content
-    from converters.formats.torchscript import source as _source
+    from export_model.converters.files.file_probe import Content
+    from export_model.converters.formats.torchscript import source as _source
 else:
     (_source,) = defer_imports(__name__, "source")
 

@@ -10,7 +10,7 @@ import ast
 import warnings
 from collections.abc import Mapping
 
-from signatures.errors import DamagedFileError, SourceError
+from export_model.signatures.errors import DamagedFileError, SourceError
 
 _DAMAGED = "copy or download it again"
 

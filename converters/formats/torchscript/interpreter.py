@@ -13,11 +13,11 @@ from typing import Any
 
 from msgspec import Struct
 
-from converters.formats.torchscript.code import Code
-from converters.formats.torchscript.machine import Machine
-from converters.formats.torchscript.ops.table import OPS
-from converters.formats.torchscript.values import Module, Named, Tensor
-from signatures.errors import DamagedFileError, ExportModelError, SourceError, UnsupportedOpError
+from export_model.converters.formats.torchscript.code import Code
+from export_model.converters.formats.torchscript.machine import Machine
+from export_model.converters.formats.torchscript.ops.table import OPS
+from export_model.converters.formats.torchscript.values import Module, Named, Tensor
+from export_model.signatures.errors import DamagedFileError, ExportModelError, SourceError, UnsupportedOpError
 
 #: Statements that are walked through; a policy has some hundreds, loops included.
 MAX_STATEMENTS = 100_000

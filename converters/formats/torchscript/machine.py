@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from converters.files import unpickle
-from converters.files.pickled_objects import Instance
-from converters.files.torchscript_archive import ScriptArchive
-from converters.formats.torchscript.values import LengthFoundError, Module, ShapeFoundError, Tensor
-from converters.graph.builder import Builder
-from converters.graph.nodes import NameScope, Node
-from converters.graph.types import BOOL, FLOAT32, INT32, INT64
-from signatures.errors import DamagedFileError, SourceError, UnsupportedOpError
+from export_model.converters.files import unpickle
+from export_model.converters.files.pickled_objects import Instance
+from export_model.converters.files.torchscript_archive import ScriptArchive
+from export_model.converters.formats.torchscript.values import LengthFoundError, Module, ShapeFoundError, Tensor
+from export_model.converters.graph.builder import Builder
+from export_model.converters.graph.nodes import NameScope, Node
+from export_model.converters.graph.types import BOOL, FLOAT32, INT32, INT64
+from export_model.signatures.errors import DamagedFileError, SourceError, UnsupportedOpError
 
 #: c10/core/ScalarType.h: the numbers that a program calls dtypes by.
 DTYPES: Mapping[int, np.dtype[Any]] = {

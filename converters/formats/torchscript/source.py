@@ -15,21 +15,21 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from converters.files.fetch import Fetched
-from converters.files.pickled_objects import Instance
-from converters.files.torch_archive import Storage
-from converters.files.torchscript_archive import ScriptArchive
-from converters.files.unpickle import Tensor as Stored
-from converters.formats.source import ReadOptions, SourceModel
-from converters.formats.torchscript.code import Code
-from converters.formats.torchscript.interpreter import Interpreter
-from converters.formats.torchscript.machine import MEMORY_IN, MEMORY_OUT, Machine
-from converters.formats.torchscript.values import LengthFoundError, Module, ShapeFoundError, Tensor
-from converters.graph.types import FLOAT32
-from converters.policy.facts import DOUBLES_NARROWED, SourceFacts
-from converters.policy.memories import part_of, stem_of
-from signatures.errors import NotAPolicyError, SourceError, UnsupportedOpError, UsageError
-from signatures.roles import Role
+from export_model.converters.files.fetch import Fetched
+from export_model.converters.files.pickled_objects import Instance
+from export_model.converters.files.torch_archive import Storage
+from export_model.converters.files.torchscript_archive import ScriptArchive
+from export_model.converters.files.unpickle import Tensor as Stored
+from export_model.converters.formats.source import ReadOptions, SourceModel
+from export_model.converters.formats.torchscript.code import Code
+from export_model.converters.formats.torchscript.interpreter import Interpreter
+from export_model.converters.formats.torchscript.machine import MEMORY_IN, MEMORY_OUT, Machine
+from export_model.converters.formats.torchscript.values import LengthFoundError, Module, ShapeFoundError, Tensor
+from export_model.converters.graph.types import FLOAT32
+from export_model.converters.policy.facts import DOUBLES_NARROWED, SourceFacts
+from export_model.converters.policy.memories import part_of, stem_of
+from export_model.signatures.errors import NotAPolicyError, SourceError, UnsupportedOpError, UsageError
+from export_model.signatures.roles import Role
 
 _MAX_INPUTS, _MAX_AXES = 16, 5
 #: Times that a program is walked through: once more for each length and for its memory.

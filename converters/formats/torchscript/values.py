@@ -10,8 +10,8 @@ from collections.abc import Callable
 
 from msgspec import Struct
 
-from converters.files.pickled_objects import Instance
-from signatures.errors import UnsupportedOpError
+from export_model.converters.files.pickled_objects import Instance
+from export_model.signatures.errors import UnsupportedOpError
 
 #: Of the whole, what a view shows; of the whole and a new view, the new whole.
 Show = Callable[[str], str]

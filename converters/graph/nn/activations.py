@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 
-from converters.graph.builder import Builder
+from export_model.converters.graph.builder import Builder
 
 Activation = Callable[[Builder, str], str]
 #: The constants of tf.nn.selu and torch.nn.SELU.

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from converters.graph.types import FLOAT32, INT32, INT64
-from signatures.errors import UnsupportedOpError
+from export_model.converters.graph.types import FLOAT32, INT32, INT64
+from export_model.signatures.errors import UnsupportedOpError
 
 if TYPE_CHECKING:  # the op table, which the builder asks, writes TopKV2 with these
-    from converters.graph.builder import Builder
+    from export_model.converters.graph.builder import Builder
 
 #: Elements of a table, per row. A policy's lists have some hundreds, and a table has that squared.
 MAX_TABLE = 1 << 20

@@ -14,11 +14,11 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from converters.graph.ops.loops.layers import window_padding
-from signatures.errors import UnsupportedOpError
+from export_model.converters.graph.ops.loops.layers import window_padding
+from export_model.signatures.errors import UnsupportedOpError
 
 if TYPE_CHECKING:  # the op table, which the builder asks, writes dilated convolutions with these
-    from converters.graph.builder import Builder
+    from export_model.converters.graph.builder import Builder
 
 MAX_GROUPS = 256
 Pair = tuple[int, int]

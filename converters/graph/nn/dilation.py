@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from msgspec import Struct
 
-from converters.graph.nn.convolution import Window, conv2d
-from signatures.errors import UnsupportedOpError
+from export_model.converters.graph.nn.convolution import Window, conv2d
+from export_model.signatures.errors import UnsupportedOpError
 
 if TYPE_CHECKING:  # the op table, which the builder asks, writes BatchToSpaceND with these
-    from converters.graph.builder import Builder
+    from export_model.converters.graph.builder import Builder
 
 
 class Blocks(Struct, frozen=True):

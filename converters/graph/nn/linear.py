@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from converters.graph.builder import Builder
+from export_model.converters.graph.builder import Builder
 
 
 def matmul(b: Builder, x: str, y: str) -> str:

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from converters.graph.builder import Builder
-from converters.graph.nn.linear import matmul
-from converters.graph.types import FLOAT32
-from signatures.errors import UnsupportedOpError
+from export_model.converters.graph.builder import Builder
+from export_model.converters.graph.nn.linear import matmul
+from export_model.converters.graph.types import FLOAT32
+from export_model.signatures.errors import UnsupportedOpError
 
 
 def batch(

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from converters.graph.builder import Builder
-from converters.graph.nn.convolution import Pair, Window, pad_image
-from converters.graph.types import FLOAT32
-from signatures.errors import UnsupportedOpError
+from export_model.converters.graph.builder import Builder
+from export_model.converters.graph.nn.convolution import Pair, Window, pad_image
+from export_model.converters.graph.types import FLOAT32
+from export_model.signatures.errors import UnsupportedOpError
 
 #: Places of a window with gaps, each of which is a slice.
 _MAX_PLACES = 64

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from converters.graph.builder import Builder
-from converters.graph.nn.activations import Activation
+from export_model.converters.graph.builder import Builder
+from export_model.converters.graph.nn.activations import Activation
 
 Array = np.ndarray
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from converters.graph.builder import Builder
+from export_model.converters.graph.builder import Builder
 
 Reduction = Callable[[Builder, str, Sequence[int], bool], str]
 

@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
-from converters.graph.builder import Builder
-from converters.graph.nn.choosing import last, moved_back
-from converters.graph.nn.linear import matmul
-from signatures.errors import UnsupportedOpError
+from export_model.converters.graph.builder import Builder
+from export_model.converters.graph.nn.choosing import last, moved_back
+from export_model.converters.graph.nn.linear import matmul
+from export_model.signatures.errors import UnsupportedOpError
 
 Places = npt.NDArray[np.float32]
 Weights = npt.NDArray[np.float64]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from converters.graph.builder import Builder
-from converters.graph.nn.activations import clip, scale_and_shift
+from export_model.converters.graph.builder import Builder
+from export_model.converters.graph.nn.activations import clip, scale_and_shift
 
 
 def sinh(b: Builder, x: str) -> str:

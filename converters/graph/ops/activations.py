@@ -7,18 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from converters.graph.nodes import Node
-from converters.graph.ops.barracuda import decompositions
-from converters.graph.ops.barracuda import elementwise as nn
-from converters.graph.ops.barracuda.base import Nn
-from converters.graph.ops.barracuda.vocabulary import Activation
-from converters.graph.ops.base import Attr, Lower, OnnxBuilder, OpDef, chain, plain, same_as
-from converters.graph.ops.elementwise import T, smooth, unary, wide
-from converters.graph.ops.litert import elementwise as litert
-from converters.graph.ops.litert.base import Operator, builtin
-from converters.graph.ops.loops import elementwise as loops
-from converters.graph.ops.loops.base import Elementwise, simple
-from converters.graph.ops.older import leaky_relu
+from export_model.converters.graph.nodes import Node
+from export_model.converters.graph.ops.barracuda import decompositions
+from export_model.converters.graph.ops.barracuda import elementwise as nn
+from export_model.converters.graph.ops.barracuda.base import Nn
+from export_model.converters.graph.ops.barracuda.vocabulary import Activation
+from export_model.converters.graph.ops.base import Attr, Lower, OnnxBuilder, OpDef, chain, plain, same_as
+from export_model.converters.graph.ops.elementwise import T, smooth, unary, wide
+from export_model.converters.graph.ops.litert import elementwise as litert
+from export_model.converters.graph.ops.litert.base import Operator, builtin
+from export_model.converters.graph.ops.loops import elementwise as loops
+from export_model.converters.graph.ops.loops.base import Elementwise, simple
+from export_model.converters.graph.ops.older import leaky_relu
 
 
 def _sigmoid(x: np.ndarray) -> np.ndarray:

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from converters.graph.nodes import Node, TensorShape
-from converters.graph.ops.barracuda import arrays as nn
-from converters.graph.ops.barracuda.base import Nn
-from converters.graph.ops.base import (
+from export_model.converters.graph.nodes import Node, TensorShape
+from export_model.converters.graph.ops.barracuda import arrays as nn
+from export_model.converters.graph.ops.barracuda.base import Nn
+from export_model.converters.graph.ops.base import (
     Attr,
     OnnxBuilder,
     OpDef,
@@ -30,11 +30,11 @@ from converters.graph.ops.base import (
     shape_error,
     type_attr,
 )
-from converters.graph.ops.litert import arrays as litert
-from converters.graph.ops.litert.base import LitertBuilder, Value, same, without
-from converters.graph.ops.loops.arrays import transpose
-from converters.graph.ops.loops.base import view
-from converters.graph.types import BATCH, INT32, Dim, Symbols, TensorType, of_array, product
+from export_model.converters.graph.ops.litert import arrays as litert
+from export_model.converters.graph.ops.litert.base import LitertBuilder, Value, same, without
+from export_model.converters.graph.ops.loops.arrays import transpose
+from export_model.converters.graph.ops.loops.base import view
+from export_model.converters.graph.types import BATCH, INT32, Dim, Symbols, TensorType, of_array, product
 
 T = type_attr()
 

@@ -13,13 +13,13 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from msgspec import Struct
 
-from converters.graph.nodes import Node
-from converters.graph.ops.barracuda.base import Nn
-from converters.graph.ops.litert.base import Litert
-from converters.graph.ops.loops.base import Loops
-from converters.graph.ops.rewriting import Decomposition, Older, Shape, Tfjs
-from converters.graph.types import INT64, Dim, Symbols, TensorType, broadcast
-from signatures.errors import GraphError, UnsupportedOpError
+from export_model.converters.graph.nodes import Node
+from export_model.converters.graph.ops.barracuda.base import Nn
+from export_model.converters.graph.ops.litert.base import Litert
+from export_model.converters.graph.ops.loops.base import Loops
+from export_model.converters.graph.ops.rewriting import Decomposition, Older, Shape, Tfjs
+from export_model.converters.graph.types import INT64, Dim, Symbols, TensorType, broadcast
+from export_model.signatures.errors import GraphError, UnsupportedOpError
 
 Kernel = Callable[..., Any]
 Infer = Callable[[Node, Sequence[TensorType], Symbols], Sequence[TensorType]]

@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from converters.graph.builder import Builder
-from converters.graph.nn.linear import matmul
-from converters.graph.nn.reduction import over_last_axis
-from converters.graph.nodes import Graph, NameScope, Node, ref
-from converters.graph.ops.table import op_of
-from converters.graph.shapes import infer_types
-from converters.graph.types import BATCH, BOOL, INT32, Dim
-from signatures.errors import UnsupportedOpError
+from export_model.converters.graph.builder import Builder
+from export_model.converters.graph.nn.linear import matmul
+from export_model.converters.graph.nn.reduction import over_last_axis
+from export_model.converters.graph.nodes import Graph, NameScope, Node, ref
+from export_model.converters.graph.ops.table import op_of
+from export_model.converters.graph.shapes import infer_types
+from export_model.converters.graph.types import BATCH, BOOL, INT32, Dim
+from export_model.signatures.errors import UnsupportedOpError
 
 
 class Rows:

@@ -6,16 +6,16 @@ from collections.abc import Callable
 
 from msgspec import Struct
 
-from converters.graph.nn.dilation import (
+from export_model.converters.graph.nn.dilation import (
     Blocks,
     batch_to_space,
     blocks_of,
     convolve_dilated,
     space_to_batch,
 )
-from converters.graph.nodes import Node, normal_ref
-from converters.graph.ops.base import OpDef, written_as_older
-from converters.graph.ops.rewriting import GraphBuilder, refuse_by_name
+from export_model.converters.graph.nodes import Node, normal_ref
+from export_model.converters.graph.ops.base import OpDef, written_as_older
+from export_model.converters.graph.ops.rewriting import GraphBuilder, refuse_by_name
 
 _CONVOLUTIONS = ("Conv2D", "DepthwiseConv2dNative")
 #: What makes a sequence of an image of height 1, and an image of a sequence.

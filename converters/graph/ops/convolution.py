@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from msgspec.structs import replace
 
-from converters.graph.nodes import Node
-from converters.graph.ops.activations import (
+from export_model.converters.graph.nodes import Node
+from export_model.converters.graph.ops.activations import (
     FUSED,
     LITERT_OPERATORS,
     LOOPS,
@@ -19,11 +19,11 @@ from converters.graph.ops.activations import (
     apply_activations,
     lower_activated,
 )
-from converters.graph.ops.barracuda import arrays as nn_arrays
-from converters.graph.ops.barracuda import layers as nn
-from converters.graph.ops.barracuda.base import FIRST, Nn
-from converters.graph.ops.barracuda.vocabulary import LayerType
-from converters.graph.ops.base import (
+from export_model.converters.graph.ops.barracuda import arrays as nn_arrays
+from export_model.converters.graph.ops.barracuda import layers as nn
+from export_model.converters.graph.ops.barracuda.base import FIRST, Nn
+from export_model.converters.graph.ops.barracuda.vocabulary import LayerType
+from export_model.converters.graph.ops.base import (
     REQUIRED,
     Attr,
     Kernel,
@@ -36,14 +36,14 @@ from converters.graph.ops.base import (
     shape_error,
     type_attr,
 )
-from converters.graph.ops.litert.base import Litert
-from converters.graph.ops.litert.layers import conv2d, depthwise, pad, pool
-from converters.graph.ops.loops import arrays
-from converters.graph.ops.loops import layers as loops
-from converters.graph.ops.loops.layers import window_padding
-from converters.graph.ops.rewriting import GraphBuilder
-from converters.graph.types import INT32, Dim, Symbols, TensorType
-from signatures.errors import UnsupportedOpError
+from export_model.converters.graph.ops.litert.base import Litert
+from export_model.converters.graph.ops.litert.layers import conv2d, depthwise, pad, pool
+from export_model.converters.graph.ops.loops import arrays
+from export_model.converters.graph.ops.loops import layers as loops
+from export_model.converters.graph.ops.loops.layers import window_padding
+from export_model.converters.graph.ops.rewriting import GraphBuilder
+from export_model.converters.graph.types import INT32, Dim, Symbols, TensorType
+from export_model.signatures.errors import UnsupportedOpError
 
 T = type_attr()
 _TO_NCHW, _TO_NHWC = [0, 3, 1, 2], [0, 2, 3, 1]

@@ -7,9 +7,9 @@ from string import ascii_letters
 
 import numpy as np
 
-from converters.graph.ops.rewriting import NodeBuilder, Shape
-from converters.graph.types import INT32, Dim
-from signatures.errors import UnsupportedOpError
+from export_model.converters.graph.ops.rewriting import NodeBuilder, Shape
+from export_model.converters.graph.types import INT32, Dim
+from export_model.signatures.errors import UnsupportedOpError
 
 _OPERANDS = 2
 

@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from converters.graph.nodes import Node
-from converters.graph.ops.barracuda import decompositions
-from converters.graph.ops.barracuda import elementwise as nn
-from converters.graph.ops.barracuda.arrays import same
-from converters.graph.ops.barracuda.base import Nn
-from converters.graph.ops.barracuda.vocabulary import Activation, LayerType
-from converters.graph.ops.base import (
+from export_model.converters.graph.nodes import Node
+from export_model.converters.graph.ops.barracuda import decompositions
+from export_model.converters.graph.ops.barracuda import elementwise as nn
+from export_model.converters.graph.ops.barracuda.arrays import same
+from export_model.converters.graph.ops.barracuda.base import Nn
+from export_model.converters.graph.ops.barracuda.vocabulary import Activation, LayerType
+from export_model.converters.graph.ops.base import (
     REQUIRED,
     Attr,
     Lower,
@@ -32,13 +32,13 @@ from converters.graph.ops.base import (
     scalar,
     type_attr,
 )
-from converters.graph.ops.litert import elementwise as litert
-from converters.graph.ops.litert.base import builtin, steps
-from converters.graph.ops.loops import elementwise as loops
-from converters.graph.ops.loops.base import Elementwise, simple
-from converters.graph.ops.older import clip
-from converters.graph.ops.rewriting import GraphBuilder
-from converters.graph.types import BOOL, INT32, INT64, Symbols, TensorType
+from export_model.converters.graph.ops.litert import elementwise as litert
+from export_model.converters.graph.ops.litert.base import builtin, steps
+from export_model.converters.graph.ops.loops import elementwise as loops
+from export_model.converters.graph.ops.loops.base import Elementwise, simple
+from export_model.converters.graph.ops.older import clip
+from export_model.converters.graph.ops.rewriting import GraphBuilder
+from export_model.converters.graph.types import BOOL, INT32, INT64, Symbols, TensorType
 
 T = type_attr()
 

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from converters.graph.nodes import Node
-from converters.graph.ops.arrays import target_dims
-from converters.graph.ops.barracuda import arrays as nn
-from converters.graph.ops.barracuda import decompositions
-from converters.graph.ops.barracuda.base import FIRST, NONE, Nn
-from converters.graph.ops.base import (
+from export_model.converters.graph.nodes import Node
+from export_model.converters.graph.ops.arrays import target_dims
+from export_model.converters.graph.ops.barracuda import arrays as nn
+from export_model.converters.graph.ops.barracuda import decompositions
+from export_model.converters.graph.ops.barracuda.base import FIRST, NONE, Nn
+from export_model.converters.graph.ops.base import (
     Attr,
     OnnxBuilder,
     OpDef,
@@ -28,14 +28,14 @@ from converters.graph.ops.base import (
     shape_error,
     type_attr,
 )
-from converters.graph.ops.litert import arrays as litert
-from converters.graph.ops.litert.base import builtin
-from converters.graph.ops.litert.elementwise import full_like
-from converters.graph.ops.loops import arrays as loops
-from converters.graph.ops.loops.elementwise import full_of
-from converters.graph.ops.older import broadcast_to
-from converters.graph.ops.rewriting import GraphBuilder
-from converters.graph.types import INT32, Dim, Symbols, TensorType, broadcast, product
+from export_model.converters.graph.ops.litert import arrays as litert
+from export_model.converters.graph.ops.litert.base import builtin
+from export_model.converters.graph.ops.litert.elementwise import full_like
+from export_model.converters.graph.ops.loops import arrays as loops
+from export_model.converters.graph.ops.loops.elementwise import full_of
+from export_model.converters.graph.ops.older import broadcast_to
+from export_model.converters.graph.ops.rewriting import GraphBuilder
+from export_model.converters.graph.types import INT32, Dim, Symbols, TensorType, broadcast, product
 
 T = type_attr()
 

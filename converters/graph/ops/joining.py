@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from converters.graph.nodes import Node
-from converters.graph.ops.barracuda import arrays as nn
-from converters.graph.ops.barracuda import decompositions
-from converters.graph.ops.barracuda.base import Nn
-from converters.graph.ops.base import (
+from export_model.converters.graph.nodes import Node
+from export_model.converters.graph.ops.barracuda import arrays as nn
+from export_model.converters.graph.ops.barracuda import decompositions
+from export_model.converters.graph.ops.barracuda.base import Nn
+from export_model.converters.graph.ops.base import (
     Attr,
     OnnxBuilder,
     OpDef,
@@ -27,9 +27,9 @@ from converters.graph.ops.base import (
     shape_error,
     type_attr,
 )
-from converters.graph.ops.litert import arrays as litert
-from converters.graph.ops.loops import arrays as loops
-from converters.graph.types import BATCH, Dim, Symbols, TensorType
+from export_model.converters.graph.ops.litert import arrays as litert
+from export_model.converters.graph.ops.loops import arrays as loops
+from export_model.converters.graph.types import BATCH, Dim, Symbols, TensorType
 
 T = type_attr()
 #: Outputs that a Split or Unpack may have.

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from converters.graph.nodes import Node
-from converters.graph.ops.activations import (
+from export_model.converters.graph.nodes import Node
+from export_model.converters.graph.ops.activations import (
     FUSED,
     LITERT_OPERATORS,
     LOOPS,
@@ -17,11 +17,11 @@ from converters.graph.ops.activations import (
     apply_activations,
     lower_activated,
 )
-from converters.graph.ops.barracuda import layers as nn
-from converters.graph.ops.barracuda.base import Nn
-from converters.graph.ops.barracuda.elementwise import pair
-from converters.graph.ops.barracuda.vocabulary import LayerType
-from converters.graph.ops.base import (
+from export_model.converters.graph.ops.barracuda import layers as nn
+from export_model.converters.graph.ops.barracuda.base import Nn
+from export_model.converters.graph.ops.barracuda.elementwise import pair
+from export_model.converters.graph.ops.barracuda.vocabulary import LayerType
+from export_model.converters.graph.ops.base import (
     Attr,
     Kernel,
     Lower,
@@ -33,11 +33,11 @@ from converters.graph.ops.base import (
     shape_error,
     type_attr,
 )
-from converters.graph.ops.litert.base import builtin
-from converters.graph.ops.litert.layers import matmul as litert_matmul
-from converters.graph.ops.loops import layers as loops
-from converters.graph.ops.loops.base import simple
-from converters.graph.types import BOOL, Symbols, TensorType, broadcast
+from export_model.converters.graph.ops.litert.base import builtin
+from export_model.converters.graph.ops.litert.layers import matmul as litert_matmul
+from export_model.converters.graph.ops.loops import layers as loops
+from export_model.converters.graph.ops.loops.base import simple
+from export_model.converters.graph.types import BOOL, Symbols, TensorType, broadcast
 
 T = type_attr()
 #: Elements of a matrix from which on it is made float64 in pieces, and those of a piece, which fits into caches.

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from converters.graph.nodes import Node
-from converters.graph.ops.barracuda import decompositions
-from converters.graph.ops.barracuda.base import Nn
-from converters.graph.ops.barracuda.elementwise import compare, pair
-from converters.graph.ops.barracuda.vocabulary import LayerType
-from converters.graph.ops.base import (
+from export_model.converters.graph.nodes import Node
+from export_model.converters.graph.ops.barracuda import decompositions
+from export_model.converters.graph.ops.barracuda.base import Nn
+from export_model.converters.graph.ops.barracuda.elementwise import compare, pair
+from export_model.converters.graph.ops.barracuda.vocabulary import LayerType
+from export_model.converters.graph.ops.base import (
     Attr,
     Lower,
     OnnxBuilder,
@@ -26,13 +26,13 @@ from converters.graph.ops.base import (
     same_as,
     type_attr,
 )
-from converters.graph.ops.litert.base import Litert, builtin
-from converters.graph.ops.litert.elementwise import select
-from converters.graph.ops.loops import elementwise as loops
-from converters.graph.ops.loops.base import Elementwise, Loops, simple
-from converters.graph.ops.older import select_v2
-from converters.graph.ops.rewriting import GraphBuilder
-from converters.graph.types import BOOL, Symbols, TensorType
+from export_model.converters.graph.ops.litert.base import Litert, builtin
+from export_model.converters.graph.ops.litert.elementwise import select
+from export_model.converters.graph.ops.loops import elementwise as loops
+from export_model.converters.graph.ops.loops.base import Elementwise, Loops, simple
+from export_model.converters.graph.ops.older import select_v2
+from export_model.converters.graph.ops.rewriting import GraphBuilder
+from export_model.converters.graph.types import BOOL, Symbols, TensorType
 
 T = type_attr()
 

@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from converters.graph.nn.choosing import cumulate, last, moved_back, top_k
-from converters.graph.nodes import Node, TensorShape, normal_ref, ref
-from converters.graph.ops.base import Attr, OpDef, written_as_older
-from converters.graph.ops.einsum import einsum
-from converters.graph.ops.rewriting import GraphBuilder, Older, Shape
-from converters.graph.types import BOOL, FLOAT32, INT32
-from signatures.errors import UnsupportedOpError
+from export_model.converters.graph.nn.choosing import cumulate, last, moved_back, top_k
+from export_model.converters.graph.nodes import Node, TensorShape, normal_ref, ref
+from export_model.converters.graph.ops.base import Attr, OpDef, written_as_older
+from export_model.converters.graph.ops.einsum import einsum
+from export_model.converters.graph.ops.rewriting import GraphBuilder, Older, Shape
+from export_model.converters.graph.types import BOOL, FLOAT32, INT32
+from export_model.signatures.errors import UnsupportedOpError
 
 if TYPE_CHECKING:  # it asks the table of ops
-    from converters.graph.builder import Builder
+    from export_model.converters.graph.builder import Builder
 
 _MAX_AXIS = 7
 TO_NCHW, TO_NHWC = np.array([0, 3, 1, 2], INT32), np.array([0, 2, 3, 1], INT32)

@@ -11,15 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from converters.graph.nodes import Node
-from converters.graph.ops.arrays import target_dims
-from converters.graph.ops.base import Attr, OnnxBuilder, OpDef, as_int64, not_constant, type_attr
-from converters.graph.ops.litert.arrays import sparse_to_dense
-from converters.graph.ops.litert.base import builtin
-from converters.graph.ops.loops import arrays as loops
-from converters.graph.ops.rewriting import GraphBuilder
-from converters.graph.types import INT64, Symbols, TensorType
-from signatures.errors import UnsupportedOpError
+from export_model.converters.graph.nodes import Node
+from export_model.converters.graph.ops.arrays import target_dims
+from export_model.converters.graph.ops.base import Attr, OnnxBuilder, OpDef, as_int64, not_constant, type_attr
+from export_model.converters.graph.ops.litert.arrays import sparse_to_dense
+from export_model.converters.graph.ops.litert.base import builtin
+from export_model.converters.graph.ops.loops import arrays as loops
+from export_model.converters.graph.ops.rewriting import GraphBuilder
+from export_model.converters.graph.types import INT64, Symbols, TensorType
+from export_model.signatures.errors import UnsupportedOpError
 
 
 def _infer_where(node: Node, args: Sequence[TensorType], symbols: Symbols) -> list[TensorType]:

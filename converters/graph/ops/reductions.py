@@ -8,10 +8,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from converters.graph.nodes import Node
-from converters.graph.ops.barracuda import layers as nn
-from converters.graph.ops.barracuda.vocabulary import Activation, LayerType
-from converters.graph.ops.base import (
+from export_model.converters.graph.nodes import Node
+from export_model.converters.graph.ops.barracuda import layers as nn
+from export_model.converters.graph.ops.barracuda.vocabulary import Activation, LayerType
+from export_model.converters.graph.ops.base import (
     Attr,
     OnnxBuilder,
     OpDef,
@@ -27,9 +27,9 @@ from converters.graph.ops.base import (
     same_as,
     type_attr,
 )
-from converters.graph.ops.litert.base import LitertBuilder, as_int32, builtin, ints, litert_error
-from converters.graph.ops.loops import layers as loops
-from converters.graph.types import BOOL, INT32, INT64, Dim, Symbols, TensorType
+from export_model.converters.graph.ops.litert.base import LitertBuilder, as_int32, builtin, ints, litert_error
+from export_model.converters.graph.ops.loops import layers as loops
+from export_model.converters.graph.types import BOOL, INT32, INT64, Dim, Symbols, TensorType
 
 T = type_attr()
 

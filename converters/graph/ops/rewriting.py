@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
-from converters.graph.nodes import Node, SourceName
-from converters.graph.types import Dim, TensorType
-from signatures.errors import UnsupportedOpError
+from export_model.converters.graph.nodes import Node, SourceName
+from export_model.converters.graph.types import Dim, TensorType
+from export_model.signatures.errors import UnsupportedOpError
 
 #: A shape as far as it is known; a string is a free axis.
 Shape = Sequence[Dim] | None
@@ -28,7 +28,7 @@ class NodeBuilder(Protocol):
 
 
 class GraphBuilder(NodeBuilder, Protocol):
-    """What an op that is written as other ops may use; ``converters.graph.editor.Editor`` is one."""
+    """What an op that is written as other ops may use; ``export_model.converters.graph.editor.Editor`` is one."""
 
     def ints(self, numbers: npt.ArrayLike, name: str = "const") -> str:
         """An int32 constant: a vector, or a scalar."""

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from converters.graph.nodes import Node
-from converters.graph.ops.arrays import target_dims
-from converters.graph.ops.barracuda import layers as nn
-from converters.graph.ops.barracuda.base import FIRST, Nn
-from converters.graph.ops.barracuda.vocabulary import LayerType
-from converters.graph.ops.base import (
+from export_model.converters.graph.nodes import Node
+from export_model.converters.graph.ops.arrays import target_dims
+from export_model.converters.graph.ops.barracuda import layers as nn
+from export_model.converters.graph.ops.barracuda.base import FIRST, Nn
+from export_model.converters.graph.ops.barracuda.vocabulary import LayerType
+from export_model.converters.graph.ops.base import (
     Attr,
     Kernel,
     Lower,
@@ -23,9 +23,9 @@ from converters.graph.ops.base import (
     constant_input,
     type_attr,
 )
-from converters.graph.ops.litert.arrays import multinomial, random
-from converters.graph.ops.loops import layers as loops
-from converters.graph.types import INT64, Dim, Symbols, TensorType
+from export_model.converters.graph.ops.litert.arrays import multinomial, random
+from export_model.converters.graph.ops.loops import layers as loops
+from export_model.converters.graph.types import INT64, Dim, Symbols, TensorType
 
 _SEEDS = (Attr("seed", "int", 0), Attr("seed2", "int", 0))
 

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from converters.graph.nodes import Node
-from converters.graph.ops.barracuda import arrays as nn
-from converters.graph.ops.barracuda import decompositions
-from converters.graph.ops.barracuda.base import Nn
-from converters.graph.ops.base import (
+from export_model.converters.graph.nodes import Node
+from export_model.converters.graph.ops.barracuda import arrays as nn
+from export_model.converters.graph.ops.barracuda import decompositions
+from export_model.converters.graph.ops.barracuda.base import Nn
+from export_model.converters.graph.ops.base import (
     Attr,
     OnnxBuilder,
     OpDef,
@@ -27,12 +27,12 @@ from converters.graph.ops.base import (
     shape_error,
     type_attr,
 )
-from converters.graph.ops.litert.arrays import gather
-from converters.graph.ops.litert.base import LitertBuilder, Value, as_int32, ints, with_axis
-from converters.graph.ops.loops import arrays as loops
-from converters.graph.ops.loops.base import LoopBuilder, Tensor
-from converters.graph.ops.rewriting import GraphBuilder
-from converters.graph.types import Dim, Symbols, TensorType
+from export_model.converters.graph.ops.litert.arrays import gather
+from export_model.converters.graph.ops.litert.base import LitertBuilder, Value, as_int32, ints, with_axis
+from export_model.converters.graph.ops.loops import arrays as loops
+from export_model.converters.graph.ops.loops.base import LoopBuilder, Tensor
+from export_model.converters.graph.ops.rewriting import GraphBuilder
+from export_model.converters.graph.types import Dim, Symbols, TensorType
 
 T = type_attr()
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Protocol
 
-from converters.graph.nodes import Node
-from converters.graph.ops import (
+from export_model.converters.graph.nodes import Node
+from export_model.converters.graph.ops import (
     activations,
     arrays,
     blocks,
@@ -23,8 +23,8 @@ from converters.graph.ops import (
     slicing,
     transposed,
 )
-from converters.graph.ops.base import OpDef, written_as_older
-from signatures.errors import UnsupportedOpError
+from export_model.converters.graph.ops.base import OpDef, written_as_older
+from export_model.signatures.errors import UnsupportedOpError
 
 #: While loops, conditionals and tensor arrays, by what they do: the unroll pass removes them, so they have no entry.
 CONTROL_FLOW: Mapping[str, str] = {

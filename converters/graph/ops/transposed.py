@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from converters.graph.nn.convolution import conv2d_transposed, transposed_window
-from converters.graph.nodes import Node, normal_ref
-from converters.graph.ops.base import OpDef, written_as_older
-from converters.graph.ops.rewriting import GraphBuilder, refuse_by_name
-from signatures.errors import UnsupportedOpError
+from export_model.converters.graph.nn.convolution import conv2d_transposed, transposed_window
+from export_model.converters.graph.nodes import Node, normal_ref
+from export_model.converters.graph.ops.base import OpDef, written_as_older
+from export_model.converters.graph.ops.rewriting import GraphBuilder, refuse_by_name
+from export_model.signatures.errors import UnsupportedOpError
 
 
 def result_lengths(

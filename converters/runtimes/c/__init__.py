@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 import shutil
 
-from converters.files.children.python import child_command
-from converters.runtimes.base import OWN_WORDS, Runtime, RuntimeInfo
-from signatures.errors import RuntimeUnavailableError
+from export_model.converters.files.children.python import child_command
+from export_model.converters.runtimes.base import OWN_WORDS, Runtime, RuntimeInfo
+from export_model.signatures.errors import RuntimeUnavailableError
 
 #: In the order in which they are looked for.
 COMPILERS = ("gcc", "clang")
@@ -28,7 +28,7 @@ def _command() -> list[str]:
     program = compiler()
     if program is None:
         raise RuntimeUnavailableError("no C compiler is installed", fix=_HOW)
-    return child_command("converters.runtimes.c.child", program)
+    return child_command("export_model.converters.runtimes.c.child", program)
 
 
 #: Its child confines itself: the compiler is a process that it starts.

@@ -1,4 +1,4 @@
-"""C in its own process: ``python -m converters.runtimes.c.child``.
+"""C in its own process: ``python -m export_model.converters.runtimes.c.child``.
 
 Two processes: one compiles headers, and may start the compiler; this one loads the libraries that come of it, and may
 start nothing. Neither writes outside of a folder of their own, and neither reaches a network.
@@ -18,14 +18,14 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from converters.files.children import confinement
-from converters.files.children.bounded import run_bounded
-from converters.files.children.child import Model, claim_stdout, serve
-from converters.files.children.frames import Tensors
-from converters.formats.programs.artifact import contract_held
-from converters.formats.programs.members import Header, header_of
-from converters.formats.programs.weights import weights_name
-from converters.runtimes.agents import (
+from export_model.converters.files.children import confinement
+from export_model.converters.files.children.bounded import run_bounded
+from export_model.converters.files.children.child import Model, claim_stdout, serve
+from export_model.converters.files.children.frames import Tensors
+from export_model.converters.formats.programs.artifact import contract_held
+from export_model.converters.formats.programs.members import Header, header_of
+from export_model.converters.formats.programs.weights import weights_name
+from export_model.converters.runtimes.agents import (
     AGENTS,
     CHOSEN,
     SIZES,
@@ -35,11 +35,11 @@ from converters.runtimes.agents import (
     fields_of_agent,
     fields_with_size,
 )
-from converters.runtimes.base import REFUSED
-from converters.runtimes.rows import OUTSIDE, as_declared, fed_rows, row_count
-from signatures.code import CodeOptions
-from signatures.contract import safe_name
-from signatures.errors import ExportModelError
+from export_model.converters.runtimes.base import REFUSED
+from export_model.converters.runtimes.rows import OUTSIDE, as_declared, fed_rows, row_count
+from export_model.signatures.code import CodeOptions
+from export_model.signatures.contract import safe_name
+from export_model.signatures.errors import ExportModelError
 
 FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-O2", "-ffp-contract=off", "-fPIC", "-shared")
 _C_DTYPES = {"bool": "int32"}

@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 import shutil
 
-from converters.files.children.python import child_command
-from converters.runtimes.base import OWN_WORDS, Runtime, RuntimeInfo
-from signatures.errors import RuntimeUnavailableError
+from export_model.converters.files.children.python import child_command
+from export_model.converters.runtimes.base import OWN_WORDS, Runtime, RuntimeInfo
+from export_model.signatures.errors import RuntimeUnavailableError
 
 _HOW = "sudo apt-get install mono-mcs mono-runtime" if os.name == "posix" else "mono on Linux or macOS"
 
@@ -27,7 +27,7 @@ def _command() -> list[str]:
     here = tools()
     if here is None:
         raise RuntimeUnavailableError("Mono is not installed", fix=_HOW)
-    return child_command("converters.runtimes.csharp.child", *here)
+    return child_command("export_model.converters.runtimes.csharp.child", *here)
 
 
 #: Its child confines itself: it starts the compiler and Mono.

@@ -1,4 +1,4 @@
-"""C# in its own processes: ``python -m converters.runtimes.csharp.child``.
+"""C# in its own processes: ``python -m export_model.converters.runtimes.csharp.child``.
 
 This one compiles classes and starts a Mono for each; none of them writes outside of a folder of their own, or reaches
 a network. Memory, time and system calls of each are bounded.
@@ -18,14 +18,14 @@ from typing import Any
 
 import numpy as np
 
-from converters.files.children import confinement
-from converters.files.children.bounded import bounds, run_bounded
-from converters.files.children.child import Model, claim_stdout, serve
-from converters.files.children.frames import Tensors
-from converters.formats.programs.artifact import contract_held
-from converters.formats.programs.members import Field, Header, header_of
-from converters.formats.programs.weights import weights_name
-from converters.runtimes.agents import (
+from export_model.converters.files.children import confinement
+from export_model.converters.files.children.bounded import bounds, run_bounded
+from export_model.converters.files.children.child import Model, claim_stdout, serve
+from export_model.converters.files.children.frames import Tensors
+from export_model.converters.formats.programs.artifact import contract_held
+from export_model.converters.formats.programs.members import Field, Header, header_of
+from export_model.converters.formats.programs.weights import weights_name
+from export_model.converters.runtimes.agents import (
     AGENTS,
     CHOSEN,
     SIZES,
@@ -35,10 +35,10 @@ from converters.runtimes.agents import (
     fields_of_agent,
     fields_with_size,
 )
-from converters.runtimes.base import REFUSED
-from converters.runtimes.rows import OUTSIDE, as_declared, fed_rows, row_count
-from signatures.code import CodeOptions
-from signatures.errors import ExportModelError
+from export_model.converters.runtimes.base import REFUSED
+from export_model.converters.runtimes.rows import OUTSIDE, as_declared, fed_rows, row_count
+from export_model.signatures.code import CodeOptions
+from export_model.signatures.errors import ExportModelError
 
 FLAGS = ("-langversion:7", "-warn:4", "-warnaserror", "-optimize+", "-nologo")
 #: What the compiler and a policy may take: bytes of memory, seconds of processor time, more for each byte of text.

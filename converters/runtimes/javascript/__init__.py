@@ -1,5 +1,5 @@
 """TensorFlow.js and onnxruntime-web, in Node and in Chromium."""
 
-from converters.runtimes.javascript import browser, node
+from export_model.converters.runtimes.javascript import browser, node
 
 RUNTIMES = (*node.RUNTIMES, *browser.RUNTIMES)

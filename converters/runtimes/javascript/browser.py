@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
-from converters.runtimes.base import Runtime, RuntimeInfo
-from converters.runtimes.javascript.node import (
+from export_model.converters.runtimes.base import Runtime, RuntimeInfo
+from export_model.converters.runtimes.javascript.node import (
     INSTALL_NODE,
     INSTALL_TFJS,
     SPEEDS,
@@ -27,10 +27,10 @@ from converters.runtimes.javascript.node import (
     package_version,
     runner_command,
 )
-from signatures.errors import RuntimeUnavailableError
+from export_model.signatures.errors import RuntimeUnavailableError
 
 if TYPE_CHECKING:
-    from converters.graph.ops.approximations import Arithmetic
+    from export_model.converters.graph.ops.approximations import Arithmetic
 
 CHROMIUM_VARIABLE = "EXPORT_MODEL_CHROMIUM"
 """The environment variable that names Chromium's program; it goes before every other place."""

@@ -14,11 +14,11 @@ import subprocess
 from functools import cache, partial
 from pathlib import Path
 
-from converters.files.children.python import module_origin
-from converters.runtimes.base import Progress, Runtime, RuntimeInfo
-from converters.runtimes.installed import built_beside, cache_folder, carried_out, check
-from signatures.digest import sha256_hex
-from signatures.errors import RuntimeUnavailableError
+from export_model.converters.files.children.python import module_origin
+from export_model.converters.runtimes.base import Progress, Runtime, RuntimeInfo
+from export_model.converters.runtimes.installed import built_beside, cache_folder, carried_out, check
+from export_model.signatures.digest import sha256_hex
+from export_model.signatures.errors import RuntimeUnavailableError
 
 JS_SOURCE = Path(__file__).resolve().parent / "js"
 """The folder with package.json, package-lock.json and runner.mjs; in a checkout and in site-packages alike."""

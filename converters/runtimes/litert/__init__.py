@@ -4,7 +4,7 @@ from functools import partial
 
 from msgspec.structs import replace
 
-from converters.runtimes.packages import package_runtime
+from export_model.converters.runtimes.packages import package_runtime
 
 DISTRIBUTIONS = ("ai-edge-litert", "ai-edge-litert-nightly")
 _litert = partial(

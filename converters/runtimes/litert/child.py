@@ -1,4 +1,4 @@
-"""LiteRT in its own process: ``python -m converters.runtimes.litert.child``; told ``plain``, without XNNPACK.
+"""LiteRT in its own process: ``python -m export_model.converters.runtimes.litert.child``; told ``plain``, without XNNPACK.
 
 A model is called by ``signature``, or by its tensors' own names where it has none, for as many agents as are fed.
 """
@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from converters.files.children.child import Model, claim_stdout, serve
-from converters.files.children.frames import Tensors
+from export_model.converters.files.children.child import Model, claim_stdout, serve
+from export_model.converters.files.children.frames import Tensors
 
 #: What a policy computes as float32.
 WIDE = (np.float16, np.float64)
@@ -29,7 +29,7 @@ def main() -> None:
     os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"  # before the import
     from ai_edge_litert import interpreter as litert
 
-    from converters.formats.litert.artifact import function_alone
+    from export_model.converters.formats.litert.artifact import function_alone
 
     kind = litert.OpResolverType
     resolver = kind.BUILTIN_WITHOUT_DEFAULT_DELEGATES if plain else kind.AUTO

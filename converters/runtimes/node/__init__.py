@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from converters.runtimes.base import OWN_WORDS, Runtime, RuntimeInfo
-from converters.runtimes.javascript.node import INSTALL_NODE, node_command, node_executable
+from export_model.converters.runtimes.base import OWN_WORDS, Runtime, RuntimeInfo
+from export_model.converters.runtimes.javascript.node import INSTALL_NODE, node_command, node_executable
 
 _RUNNER = Path(__file__).resolve().with_name("runner.mjs")
 

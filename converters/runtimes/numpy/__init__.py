@@ -1,5 +1,5 @@
 """The numpy reference: the kernels of the op table in a process of their own."""
 
-from converters.runtimes.packages import package_runtime
+from export_model.converters.runtimes.packages import package_runtime
 
 RUNTIMES = (package_runtime("numpy", "pip install export-model", ("numpy",), independent=False),)

@@ -2,7 +2,7 @@
 
 What no other runtime loads (a ``.nn``, formats that name numpy alone) runs here as well, through its own reader.
 
-``python -m converters.runtimes.numpy.child``
+``python -m export_model.converters.runtimes.numpy.child``
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ from typing import Any
 
 import numpy as np
 
-from converters.consumers.named_files import kernels
-from converters.files.children.child import claim_stdout, serve
-from converters.files.children.frames import Tensors
-from converters.formats.bundle.embed import runnable
-from converters.formats.format import Format
-from converters.formats.registry import FROZEN_GRAPH, WRITTEN
-from converters.graph.jitter import Jitter
-from converters.graph.nodes import Graph
-from converters.graph.ops.samplers import reseed
-from converters.graph.run import run_graph
-from converters.graph.underflow import End, Whole
-from signatures.errors import ExportModelError
+from export_model.converters.consumers.named_files import kernels
+from export_model.converters.files.children.child import claim_stdout, serve
+from export_model.converters.files.children.frames import Tensors
+from export_model.converters.formats.bundle.embed import runnable
+from export_model.converters.formats.format import Format
+from export_model.converters.formats.registry import FROZEN_GRAPH, WRITTEN
+from export_model.converters.graph.jitter import Jitter
+from export_model.converters.graph.nodes import Graph
+from export_model.converters.graph.ops.samplers import reseed
+from export_model.converters.graph.run import run_graph
+from export_model.converters.graph.underflow import End, Whole
+from export_model.signatures.errors import ExportModelError
 
 
 class _Model:
@@ -52,9 +52,9 @@ def _graph(path: Path, form: Format) -> Graph:
     """The graph of an artefact: of one in a format that no other runtime runs, as its own reader gives it."""
     if form.graph is not None:
         return form.graph(path)
-    from converters.compiler.compile import compile_graph
-    from converters.files.fetch import Fetched
-    from converters.formats.source import ReadOptions
+    from export_model.converters.compiler.compile import compile_graph
+    from export_model.converters.files.fetch import Fetched
+    from export_model.converters.formats.source import ReadOptions
 
     assert form.read is not None, f"{form.key} is not read"
     (model,) = form.read(Fetched(path), ReadOptions())

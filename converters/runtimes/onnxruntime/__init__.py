@@ -1,6 +1,6 @@
 """ONNX Runtime."""
 
-from converters.runtimes.packages import package_runtime
+from export_model.converters.runtimes.packages import package_runtime
 
 #: First come, first taken: all of them provide the package.
 DISTRIBUTIONS = (

@@ -1,4 +1,4 @@
-"""onnxruntime in its own process: ``python -m converters.runtimes.onnxruntime.child``.
+"""onnxruntime in its own process: ``python -m export_model.converters.runtimes.onnxruntime.child``.
 
 A model of ours is loaded as it lies there. A source is loaded with ``lift`` (the values of its samplers of normals,
 which become inputs); any of its inner values can then be fetched.
@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from converters.files.children.child import Model, claim_stdout, serve
-from converters.files.children.frames import Tensors
-from converters.files.folders import scratch_folder
+from export_model.converters.files.children.child import Model, claim_stdout, serve
+from export_model.converters.files.children.frames import Tensors
+from export_model.converters.files.folders import scratch_folder
 
 
 def main() -> None:
@@ -54,16 +54,16 @@ def main() -> None:
             values = self.session.run(list(fetch), feeds)
             return dict(zip(fetch, values, strict=True))
 
-    from converters.files.external_data import Detached
-    from converters.formats.onnx.messages import files_of
+    from export_model.converters.files.external_data import Detached
+    from export_model.converters.formats.onnx.messages import files_of
 
     class Source:
         """A foreign model: a session for each set of values that is asked for."""
 
         def __init__(self, path: str, draws: Sequence[str]) -> None:
-            from converters.formats.onnx import edit
-            from converters.formats.onnx.half_precision import widen
-            from converters.formats.onnx.vetted import self_contained_model
+            from export_model.converters.formats.onnx import edit
+            from export_model.converters.formats.onnx.half_precision import widen
+            from export_model.converters.formats.onnx.vetted import self_contained_model
 
             self.cut = edit.cut
             self.detached = Detached()

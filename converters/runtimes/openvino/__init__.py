@@ -2,7 +2,7 @@
 
 from msgspec.structs import replace
 
-from converters.runtimes.packages import package_runtime
+from export_model.converters.runtimes.packages import package_runtime
 
 DISTRIBUTIONS = ("openvino", "openvino-nightly")
 RUNTIMES = (

@@ -1,4 +1,4 @@
-"""OpenVINO in its own process, on the processor: ``python -m converters.runtimes.openvino.child``."""
+"""OpenVINO in its own process, on the processor: ``python -m export_model.converters.runtimes.openvino.child``."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from converters.files.children.child import Model, claim_stdout, serve
-from converters.files.children.frames import Tensors
+from export_model.converters.files.children.child import Model, claim_stdout, serve
+from export_model.converters.files.children.frames import Tensors
 
 
 def main() -> None:

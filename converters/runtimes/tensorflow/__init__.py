@@ -1,6 +1,6 @@
 """TensorFlow 2."""
 
-from converters.runtimes.packages import package_runtime
+from export_model.converters.runtimes.packages import package_runtime
 
 #: First come, first taken: all of them provide the package.
 DISTRIBUTIONS = (

@@ -6,7 +6,7 @@ SavedModel of TensorFlow 2 or a Keras model, as TensorFlow itself freezes it), `
 ``signature``), ``keras`` (a Keras model of Keras' own layers, which is not run but given back as bytes: its GraphDef as
 ``graph``, a JSON object of its inputs' and outputs' tensors as ``names``).
 
-``python -m converters.runtimes.tensorflow.child``
+``python -m export_model.converters.runtimes.tensorflow.child``
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from typing import Any
 
 import numpy as np
 
-from converters.files.children.child import Model, claim_stdout, serve
-from converters.files.children.frames import Tensors
-from converters.formats.live.freeze import FrozenFunction, frozen_function
-from converters.graph.ops.table import VARIABLES
-from signatures.errors import ExportModelError
+from export_model.converters.files.children.child import Model, claim_stdout, serve
+from export_model.converters.files.children.frames import Tensors
+from export_model.converters.formats.live.freeze import FrozenFunction, frozen_function
+from export_model.converters.graph.ops.table import VARIABLES
+from export_model.signatures.errors import ExportModelError
 
 
 def main() -> None:
@@ -104,7 +104,7 @@ def main() -> None:
         if kind == "values":
             return load_with_values(path, header["names"])
         if kind == "keras":
-            from converters.formats.keras.config import config_inside, refuse_code
+            from export_model.converters.formats.keras.config import config_inside, refuse_code
 
             refuse_code(config_inside(path), built=True)
             return _Frozen(frozen_function(path, "keras"))

@@ -5,10 +5,10 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
-from converters.files.children.python import child_command
-from converters.runtimes.base import Progress, Runtime, RuntimeInfo
-from converters.runtimes.installed import check
-from converters.runtimes.tensorflow1.release import (
+from export_model.converters.files.children.python import child_command
+from export_model.converters.runtimes.base import Progress, Runtime, RuntimeInfo
+from export_model.converters.runtimes.installed import check
+from export_model.converters.runtimes.tensorflow1.release import (
     API_LIBRARY,
     RELEASES,
     Release,
@@ -17,7 +17,7 @@ from converters.runtimes.tensorflow1.release import (
     library_folder,
     unsupported_reason,
 )
-from signatures.errors import RuntimeUnavailableError
+from export_model.signatures.errors import RuntimeUnavailableError
 
 
 def _find(release: Release) -> RuntimeInfo:
@@ -33,11 +33,15 @@ def _command(release: Release) -> list[str]:
     if not is_whole(folder):
         raise RuntimeUnavailableError(f"the runtime {release.runtime} is not installed", fix=how(release))
     check(folder, release.libraries, how(release))
-    return child_command("converters.runtimes.tensorflow1.child", release.runtime, str(folder / API_LIBRARY))
+    return child_command(
+        "export_model.converters.runtimes.tensorflow1.child", release.runtime, str(folder / API_LIBRARY)
+    )
 
 
 def _install(release: Release, progress: Progress) -> Path:
-    from converters.runtimes.tensorflow1.install import install  # what unpacks is imported where that is done
+    from export_model.converters.runtimes.tensorflow1.install import (
+        install,  # what unpacks is imported where that is done
+    )
 
     return install(release, progress)
 

@@ -1,4 +1,4 @@
-"""An old TensorFlow in its own process: ``python -m converters.runtimes.tensorflow1.child NAME LIBRARY``.
+"""An old TensorFlow in its own process: ``python -m export_model.converters.runtimes.tensorflow1.child NAME LIBRARY``.
 
 NAME is the runtime's, LIBRARY the path of the shared object that has the C API. An assertion within TensorFlow ends
 this process, not its parent.
@@ -11,8 +11,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from converters.files.children.child import claim_stdout, serve
-from converters.runtimes.tensorflow1.library import LegacyError, LegacySession, library_version, load_library
+from export_model.converters.files.children.child import claim_stdout, serve
+from export_model.converters.runtimes.tensorflow1.library import (
+    LegacyError,
+    LegacySession,
+    library_version,
+    load_library,
+)
 
 
 def main() -> None:

@@ -10,9 +10,9 @@ import tempfile
 import zipfile
 from pathlib import Path
 
-from converters.runtimes.base import Progress
-from converters.runtimes.installed import built_beside, carried_out
-from converters.runtimes.tensorflow1.release import (
+from export_model.converters.runtimes.base import Progress
+from export_model.converters.runtimes.installed import built_beside, carried_out
+from export_model.converters.runtimes.tensorflow1.release import (
     API_LIBRARY,
     LIBRARIES,
     Release,
@@ -21,8 +21,8 @@ from converters.runtimes.tensorflow1.release import (
     library_folder,
     unsupported_reason,
 )
-from signatures.digest import sha256_hex
-from signatures.errors import RuntimeUnavailableError
+from export_model.signatures.digest import sha256_hex
+from export_model.signatures.errors import RuntimeUnavailableError
 
 _ERROR_LINES = 3
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from signatures.dtypes import DATA_TYPES
+from export_model.signatures.dtypes import DATA_TYPES
 
 #: What the C API had then.
 _DTYPES = {t.tensorflow: t.dtype for t in DATA_TYPES if t.tensorflow < 20}

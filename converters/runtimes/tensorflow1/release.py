@@ -15,7 +15,7 @@ from pathlib import Path
 
 from msgspec import Struct
 
-from converters.runtimes.installed import cache_folder
+from export_model.converters.runtimes.installed import cache_folder
 
 API_LIBRARY = "_pywrap_tensorflow_internal.so"
 #: The API library finds the other one beside itself (RUNPATH $ORIGIN).

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from converters.trainers.mlagents.policy import rebuild
-from converters.trainers.mlagents.state import State, actor_in
-from converters.trainers.trainer import Rebuilt, Saved, Trainer
+from export_model.converters.trainers.mlagents.policy import rebuild
+from export_model.converters.trainers.mlagents.state import State, actor_in
+from export_model.converters.trainers.trainer import Rebuilt, Saved, Trainer
 
 
 def _rebuild(saved: Saved, policy: Mapping[Any, Any]) -> Rebuilt:

@@ -9,13 +9,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from converters.graph.nn.activations import swish
-from converters.graph.nn.linear import matmul
-from converters.graph.nn.normalisation import standardise
-from converters.graph.nn.reduction import over_last_axis
-from converters.graph.types import FLOAT32
-from converters.trainers.pytorch.network import TINY, Network
-from converters.trainers.pytorch.weights import Weights
+from export_model.converters.graph.nn.activations import swish
+from export_model.converters.graph.nn.linear import matmul
+from export_model.converters.graph.nn.normalisation import standardise
+from export_model.converters.graph.nn.reduction import over_last_axis
+from export_model.converters.graph.types import FLOAT32
+from export_model.converters.trainers.pytorch.network import TINY, Network
+from export_model.converters.trainers.pytorch.weights import Weights
 
 #: Of ``ResidualSelfAttention``: heads, what a forbidden score becomes, which sum of squares is no entity yet.
 HEADS, FORBIDDEN, NOTHING = 4, -1e6, 0.01

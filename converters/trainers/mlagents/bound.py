@@ -7,10 +7,10 @@ from pathlib import Path
 
 from msgspec import Struct
 
-from converters.files.fetch import Fetched
-from converters.files.wire_format import WireError, message_fields
-from converters.trainers.mlagents.state import LET_IT_EXPORT, State
-from signatures.errors import SourceError
+from export_model.converters.files.fetch import Fetched
+from export_model.converters.files.wire_format import WireError, message_fields
+from export_model.converters.trainers.mlagents.state import LET_IT_EXPORT, State
+from export_model.signatures.errors import SourceError
 
 #: Tags of ModelProto.graph, GraphProto.node and NodeProto.op_type (onnx.proto).
 _OP_TYPE = (0x3A, 0x0A, 0x22)

@@ -25,20 +25,20 @@ from collections.abc import Sequence
 import numpy as np
 from msgspec import Struct
 
-from converters.files.fetch import Fetched
-from converters.graph.nn.activations import clip, leaky_relu, swish
-from converters.policy.facts import SourceFacts
-from converters.policy.generations import SAC_MEAN, TORCH_VERSION_3
-from converters.policy.rules import Decision
-from converters.trainers.mlagents.body import attend, body_width, goal_width, hidden_layers
-from converters.trainers.mlagents.bound import Bound, find_bound, trainer_of
-from converters.trainers.mlagents.sensors import Sensor, dense_name, encoder_of, find_goals, find_sensors
-from converters.trainers.mlagents.state import State
-from converters.trainers.pytorch.activations import LEAKY_SLOPE
-from converters.trainers.pytorch.network import Network
-from converters.trainers.pytorch.weights import pytorch_alone
-from converters.trainers.trainer import Rebuilt
-from signatures.roles import (
+from export_model.converters.files.fetch import Fetched
+from export_model.converters.graph.nn.activations import clip, leaky_relu, swish
+from export_model.converters.policy.facts import SourceFacts
+from export_model.converters.policy.generations import SAC_MEAN, TORCH_VERSION_3
+from export_model.converters.policy.rules import Decision
+from export_model.converters.trainers.mlagents.body import attend, body_width, goal_width, hidden_layers
+from export_model.converters.trainers.mlagents.bound import Bound, find_bound, trainer_of
+from export_model.converters.trainers.mlagents.sensors import Sensor, dense_name, encoder_of, find_goals, find_sensors
+from export_model.converters.trainers.mlagents.state import State
+from export_model.converters.trainers.pytorch.activations import LEAKY_SLOPE
+from export_model.converters.trainers.pytorch.network import Network
+from export_model.converters.trainers.pytorch.weights import pytorch_alone
+from export_model.converters.trainers.trainer import Rebuilt
+from export_model.signatures.roles import (
     ACTION_SHAPE,
     CONTINUOUS_SHAPE,
     DISCRETE_SHAPE,

@@ -12,10 +12,10 @@ from collections.abc import Mapping, Sequence
 
 from msgspec import Struct
 
-from converters.policy.rules import Rule, first
-from converters.trainers.mlagents.state import LET_IT_EXPORT
-from converters.trainers.pytorch.weights import Weights
-from signatures.errors import SourceError, UsageError
+from export_model.converters.policy.rules import Rule, first
+from export_model.converters.trainers.mlagents.state import LET_IT_EXPORT
+from export_model.converters.trainers.pytorch.weights import Weights
+from export_model.signatures.errors import SourceError, UsageError
 
 #: Larger sides are not looked for.
 _LONGEST = 1024

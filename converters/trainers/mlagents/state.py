@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from converters.files.unpickle import Tensor
-from converters.trainers.pytorch.weights import TensorFile, Weights
-from signatures.roles import VERSION_NUMBER
+from export_model.converters.files.unpickle import Tensor
+from export_model.converters.trainers.pytorch.weights import TensorFile, Weights
+from export_model.signatures.roles import VERSION_NUMBER
 
 #: What a reader of a checkpoint can always do instead: ML-Agents writes the ONNX when it saves.
 LET_IT_EXPORT = (

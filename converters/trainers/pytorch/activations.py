@@ -13,8 +13,8 @@ import re
 from functools import partial
 from pathlib import Path
 
-from converters.files.fetch import Fetched
-from converters.graph.nn.activations import (
+from export_model.converters.files.fetch import Fetched
+from export_model.converters.graph.nn.activations import (
     NAMED,
     Activation,
     celu,
@@ -24,7 +24,7 @@ from converters.graph.nn.activations import (
     leaky_relu,
     log_sigmoid,
 )
-from signatures.errors import SourceError, UsageError
+from export_model.signatures.errors import SourceError, UsageError
 
 LEAKY_SLOPE = 0.01
 _KNOWN: dict[str, Activation] = {

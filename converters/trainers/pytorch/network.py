@@ -13,14 +13,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from converters.graph.builder import Builder
-from converters.graph.nn.activations import Activation, clip
-from converters.graph.nn.convolution import Window, conv2d
-from converters.graph.nn.linear import matmul
-from converters.graph.nn.recurrent import gru, lstm
-from converters.graph.nodes import NameScope, Node
-from converters.graph.types import FLOAT32, INT32, INT64
-from converters.trainers.pytorch.weights import Weights
+from export_model.converters.graph.builder import Builder
+from export_model.converters.graph.nn.activations import Activation, clip
+from export_model.converters.graph.nn.convolution import Window, conv2d
+from export_model.converters.graph.nn.linear import matmul
+from export_model.converters.graph.nn.recurrent import gru, lstm
+from export_model.converters.graph.nodes import NameScope, Node
+from export_model.converters.graph.types import FLOAT32, INT32, INT64
+from export_model.converters.trainers.pytorch.weights import Weights
 
 #: Added before a logarithm (``EPSILON`` in distributions.py).
 TINY = 1e-7

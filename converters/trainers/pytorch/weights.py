@@ -8,8 +8,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from converters.files.unpickle import Tensor
-from signatures.errors import DamagedFileError, SourceError
+from export_model.converters.files.unpickle import Tensor
+from export_model.signatures.errors import DamagedFileError, SourceError
 
 
 class TensorFile(Protocol):

@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from converters.trainers.rl_games.policy import rebuild_actor_critic, rebuild_soft_actor
-from converters.trainers.settings import needed_settings
-from converters.trainers.trainer import Rebuilt, Saved, Trainer
+from export_model.converters.trainers.rl_games.policy import rebuild_actor_critic, rebuild_soft_actor
+from export_model.converters.trainers.settings import needed_settings
+from export_model.converters.trainers.trainer import Rebuilt, Saved, Trainer
 
 #: Where a run keeps its settings: Isaac Lab, rl_games itself, IsaacGymEnvs (below ``train``).
 _FILES = ("params/agent.yaml", "agent.yaml", "config.yaml")

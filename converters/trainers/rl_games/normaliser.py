@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 
-from converters.graph.nn.activations import clip
-from converters.graph.types import FLOAT32
-from converters.trainers.pytorch.network import Network
-from converters.trainers.pytorch.weights import Weights
-from converters.trainers.trainer import Saved
+from export_model.converters.graph.nn.activations import clip
+from export_model.converters.graph.types import FLOAT32
+from export_model.converters.trainers.pytorch.network import Network
+from export_model.converters.trainers.pytorch.weights import Weights
+from export_model.converters.trainers.trainer import Saved
 
 _EPSILON = np.float32(1e-5)
 _LIMIT = 5

@@ -11,18 +11,18 @@ from typing import Any
 
 from msgspec import Struct, field
 
-from converters.graph.nn.activations import clip
-from converters.graph.nn.convolution import Window
-from converters.graph.nn.normalisation import layer
-from converters.graph.nodes import Graph
-from converters.policy.facts import SourceFacts
-from converters.trainers.pytorch.network import Network
-from converters.trainers.pytorch.weights import Weights, pytorch_alone
-from converters.trainers.rl_games.normaliser import normalise, observed_shape
-from converters.trainers.settings import Settings
-from converters.trainers.trainer import Saved
-from signatures.errors import SourceError
-from signatures.roles import Role
+from export_model.converters.graph.nn.activations import clip
+from export_model.converters.graph.nn.convolution import Window
+from export_model.converters.graph.nn.normalisation import layer
+from export_model.converters.graph.nodes import Graph
+from export_model.converters.policy.facts import SourceFacts
+from export_model.converters.trainers.pytorch.network import Network
+from export_model.converters.trainers.pytorch.weights import Weights, pytorch_alone
+from export_model.converters.trainers.rl_games.normaliser import normalise, observed_shape
+from export_model.converters.trainers.settings import Settings
+from export_model.converters.trainers.trainer import Saved
+from export_model.signatures.errors import SourceError
+from export_model.signatures.roles import Role
 
 EXPORT_ONNX = "load it in rl_games, export the module that gives the action (torch.onnx.export), and give the .onnx"
 _MODELS = ("continuous_a2c", "continuous_a2c_logstd", "discrete_a2c", "multi_discrete_a2c")

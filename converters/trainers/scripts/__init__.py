@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from converters.policy.facts import SourceFacts
-from converters.trainers.pytorch.activations import activation_of
-from converters.trainers.pytorch.network import Network
-from converters.trainers.pytorch.weights import Weights, pytorch_alone
-from converters.trainers.scripts.building import Making
-from converters.trainers.scripts.choice import EXPORT_ONNX, Known, choose_script, known_state
-from converters.trainers.trainer import Rebuilt, Saved, Trainer
+from export_model.converters.policy.facts import SourceFacts
+from export_model.converters.trainers.pytorch.activations import activation_of
+from export_model.converters.trainers.pytorch.network import Network
+from export_model.converters.trainers.pytorch.weights import Weights, pytorch_alone
+from export_model.converters.trainers.scripts.building import Making
+from export_model.converters.trainers.scripts.choice import EXPORT_ONNX, Known, choose_script, known_state
+from export_model.converters.trainers.trainer import Rebuilt, Saved, Trainer
 
 _USUAL = "CleanRL's scripts have tanh in PPO, relu elsewhere and before images"
 

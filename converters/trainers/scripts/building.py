@@ -6,12 +6,12 @@ import itertools
 
 from msgspec import Struct
 
-from converters.graph.nn.activations import Activation
-from converters.graph.nn.normalisation import layer
-from converters.trainers.pytorch.network import Network
-from converters.trainers.trainer import Saved
-from signatures.errors import UsageError
-from signatures.roles import Role
+from export_model.converters.graph.nn.activations import Activation
+from export_model.converters.graph.nn.normalisation import layer
+from export_model.converters.trainers.pytorch.network import Network
+from export_model.converters.trainers.trainer import Saved
+from export_model.signatures.errors import UsageError
+from export_model.signatures.roles import Role
 
 #: (kernel, stride) of the convolutions before Atari's images.
 _WINDOWS = ((8, 4), (4, 2), (3, 1))

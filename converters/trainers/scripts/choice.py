@@ -12,9 +12,9 @@ from typing import Any
 
 from msgspec import Struct
 
-from converters.trainers.scripts.table import CLEANRL, PPO_PYTORCH, SCRIPTS, Script, shape_of, width_of
-from converters.trainers.trainer import Saved
-from signatures.errors import SourceError, UsageError, suggestion
+from export_model.converters.trainers.scripts.table import CLEANRL, PPO_PYTORCH, SCRIPTS, Script, shape_of, width_of
+from export_model.converters.trainers.trainer import Saved
+from export_model.signatures.errors import SourceError, UsageError, suggestion
 
 EXPORT_ONNX = "export the policy to ONNX in its own project (torch.onnx.export), and give that"
 #: What a script calls its files: (maker, pattern of the file's name, pattern of its folder's, what it is).

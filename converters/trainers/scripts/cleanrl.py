@@ -4,9 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from converters.trainers.rsl_rl import per_action
-from converters.trainers.scripts.building import Making, observation_input, sequence, squash_to_bounds, trunk
-from signatures.roles import Role
+from export_model.converters.trainers.rsl_rl import per_action
+from export_model.converters.trainers.scripts.building import (
+    Making,
+    observation_input,
+    sequence,
+    squash_to_bounds,
+    trunk,
+)
+from export_model.signatures.roles import Role
 
 #: The logarithm of SAC's deviation lies between these.
 _LOWEST, _HIGHEST = -5.0, 2.0

@@ -5,8 +5,8 @@ The deviation of a continuous action is the constructor's (``action_std_init``),
 
 from __future__ import annotations
 
-from converters.trainers.scripts.building import Making, observation_input, sequence
-from signatures.roles import Role
+from export_model.converters.trainers.scripts.building import Making, observation_input, sequence
+from export_model.signatures.roles import Role
 
 
 def _mean(making: Making) -> str:

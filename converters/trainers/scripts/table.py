@@ -14,9 +14,9 @@ from typing import Any
 
 from msgspec import Struct
 
-from converters.files.unpickle import Tensor
-from converters.trainers.scripts import cleanrl, ppo_pytorch
-from converters.trainers.scripts.building import Making
+from export_model.converters.files.unpickle import Tensor
+from export_model.converters.trainers.scripts import cleanrl, ppo_pytorch
+from export_model.converters.trainers.scripts.building import Making
 
 
 class Script(Struct, frozen=True, kw_only=True):

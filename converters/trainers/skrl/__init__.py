@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from converters.trainers.settings import needed_settings
-from converters.trainers.skrl.policy import PREPROCESSORS, rebuild_policy
-from converters.trainers.trainer import Rebuilt, Saved, Trainer
+from export_model.converters.trainers.settings import needed_settings
+from export_model.converters.trainers.skrl.policy import PREPROCESSORS, rebuild_policy
+from export_model.converters.trainers.trainer import Rebuilt, Saved, Trainer
 
 _FILES = ("params/agent.yaml", "agent.yaml")
 

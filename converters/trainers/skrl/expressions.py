@@ -8,9 +8,9 @@ from __future__ import annotations
 import ast
 from collections.abc import Callable, Mapping
 
-from converters.trainers.pytorch.activations import activation_named
-from converters.trainers.pytorch.network import Network
-from signatures.errors import SourceError
+from export_model.converters.trainers.pytorch.activations import activation_named
+from export_model.converters.trainers.pytorch.network import Network
+from export_model.signatures.errors import SourceError
 
 MAX_EXPRESSION = 300
 _Operation = Callable[[Network, str, str], str]

@@ -14,20 +14,20 @@ from typing import Any
 import numpy as np
 from msgspec import Struct, field
 
-from converters.graph.nn.activations import Activation, clip
-from converters.graph.nn.convolution import Window
-from converters.graph.nodes import Graph
-from converters.graph.types import FLOAT32
-from converters.policy.facts import SourceFacts
-from converters.trainers.pytorch.activations import activation_named
-from converters.trainers.pytorch.network import Network
-from converters.trainers.pytorch.weights import Weights, pytorch_alone
-from converters.trainers.rsl_rl import per_action
-from converters.trainers.settings import MAX_UNITS, Settings
-from converters.trainers.skrl.expressions import evaluate
-from converters.trainers.trainer import Saved
-from signatures.errors import DamagedFileError
-from signatures.roles import Role
+from export_model.converters.graph.nn.activations import Activation, clip
+from export_model.converters.graph.nn.convolution import Window
+from export_model.converters.graph.nodes import Graph
+from export_model.converters.graph.types import FLOAT32
+from export_model.converters.policy.facts import SourceFacts
+from export_model.converters.trainers.pytorch.activations import activation_named
+from export_model.converters.trainers.pytorch.network import Network
+from export_model.converters.trainers.pytorch.weights import Weights, pytorch_alone
+from export_model.converters.trainers.rsl_rl import per_action
+from export_model.converters.trainers.settings import MAX_UNITS, Settings
+from export_model.converters.trainers.skrl.expressions import evaluate
+from export_model.converters.trainers.trainer import Saved
+from export_model.signatures.errors import DamagedFileError
+from export_model.signatures.roles import Role
 
 EXPORT_ONNX = "load it in skrl, export the policy (torch.onnx.export, its preprocessor included), and give the .onnx"
 #: Statistics of the observations, of 2.x and of 1.x.

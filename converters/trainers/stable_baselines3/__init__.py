@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from converters.trainers.stable_baselines3.normaliser import read_normaliser
-from converters.trainers.stable_baselines3.policy import to_graph
-from converters.trainers.stable_baselines3.sbx import is_sbx, read_sbx
-from converters.trainers.trainer import Rebuilt, Saved, Trainer
-from signatures.errors import NotAPolicyError
+from export_model.converters.trainers.stable_baselines3.normaliser import read_normaliser
+from export_model.converters.trainers.stable_baselines3.policy import to_graph
+from export_model.converters.trainers.stable_baselines3.sbx import is_sbx, read_sbx
+from export_model.converters.trainers.trainer import Rebuilt, Saved, Trainer
+from export_model.signatures.errors import NotAPolicyError
 
 
 def _rebuild(saved: Saved, data: Mapping[str, Any]) -> Rebuilt:

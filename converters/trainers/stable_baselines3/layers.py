@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from converters.graph.nn.activations import Activation
-from converters.graph.nn.normalisation import batch
-from converters.trainers.pytorch.network import Network
+from export_model.converters.graph.nn.activations import Activation
+from export_model.converters.graph.nn.normalisation import batch
+from export_model.converters.trainers.pytorch.network import Network
 
 
 def renormalised_mlp(net: Network, x: str, module: str, activation: Activation, epsilon: float) -> str:

@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 from msgspec import Struct, field
 
-from converters.files.pickled_objects import Instance, array_of, unpickle_objects
-from converters.graph.nn.activations import clip
-from converters.graph.types import FLOAT32
-from converters.trainers.pytorch.network import Network
-from signatures.errors import DamagedFileError, NotAPolicyError, SourceError, naming
-from signatures.roles import Role
+from export_model.converters.files.pickled_objects import Instance, array_of, unpickle_objects
+from export_model.converters.graph.nn.activations import clip
+from export_model.converters.graph.types import FLOAT32
+from export_model.converters.trainers.pytorch.network import Network
+from export_model.signatures.errors import DamagedFileError, NotAPolicyError, SourceError, naming
+from export_model.signatures.roles import Role
 
 _CLASS = "VecNormalize"
 _LIBRARIES = ("stable_baselines3", "sb3_contrib")

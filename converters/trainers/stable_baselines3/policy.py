@@ -14,18 +14,18 @@ from typing import Any, TypeAlias
 import numpy as np
 from msgspec import Struct, field
 
-from converters.graph.nn.activations import Activation, clip
-from converters.graph.nodes import Graph
-from converters.graph.types import FLOAT32, INT64
-from converters.policy.facts import SourceFacts
-from converters.trainers.pytorch.activations import activation_from_user, activation_named
-from converters.trainers.pytorch.network import Network
-from converters.trainers.pytorch.weights import TensorFile, Weights, pytorch_alone
-from converters.trainers.stable_baselines3.layers import renormalised_mlp
-from converters.trainers.stable_baselines3.normaliser import Normaliser
-from converters.trainers.stable_baselines3.spaces import Space, space_of
-from signatures.errors import DamagedFileError, SourceError, UsageError
-from signatures.roles import Role
+from export_model.converters.graph.nn.activations import Activation, clip
+from export_model.converters.graph.nodes import Graph
+from export_model.converters.graph.types import FLOAT32, INT64
+from export_model.converters.policy.facts import SourceFacts
+from export_model.converters.trainers.pytorch.activations import activation_from_user, activation_named
+from export_model.converters.trainers.pytorch.network import Network
+from export_model.converters.trainers.pytorch.weights import TensorFile, Weights, pytorch_alone
+from export_model.converters.trainers.stable_baselines3.layers import renormalised_mlp
+from export_model.converters.trainers.stable_baselines3.normaliser import Normaliser
+from export_model.converters.trainers.stable_baselines3.spaces import Space, space_of
+from export_model.signatures.errors import DamagedFileError, SourceError, UsageError
+from export_model.signatures.roles import Role
 
 _EXPORT_ONNX = "export the model to ONNX in its own project (torch.onnx.export), and give that"
 #: What a space is: one, or several by their keys.

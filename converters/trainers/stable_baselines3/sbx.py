@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 from msgspec import Struct
 
-from converters.files.pickled_objects import Instance, array_of, unpickle_objects
-from converters.trainers.pytorch.weights import ArraysByName
-from converters.trainers.stable_baselines3.spaces import Space, space_of
-from signatures.errors import DamagedFileError, SourceError
+from export_model.converters.files.pickled_objects import Instance, array_of, unpickle_objects
+from export_model.converters.trainers.pytorch.weights import ArraysByName
+from export_model.converters.trainers.stable_baselines3.spaces import Space, space_of
+from export_model.signatures.errors import DamagedFileError, SourceError
 
 _EXPORT_ONNX = "export the policy to ONNX in its own project (jax2onnx), and give that"
 _SAVE_AGAIN = "save the model again: model.save"

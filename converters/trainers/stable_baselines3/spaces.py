@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from msgspec import Struct
 
-from signatures.errors import DamagedFileError, SourceError
+from export_model.signatures.errors import DamagedFileError, SourceError
 
 _NUMBER = re.compile(r"[-+]?(?:inf|nan|\d+\.?\d*(?:e[-+]?\d+)?|\.\d+)", re.IGNORECASE)
 _MEMBER = re.compile(r"""(['"])((?:[^'"\\]|\\.){0,80})\1\s*[:,]\s*(Box|Discrete|MultiDiscrete|MultiBinary)\(""")

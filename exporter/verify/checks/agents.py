@@ -13,22 +13,37 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from converters.formats.programs.artifact import contract_held
-from converters.formats.programs.members import Header, header_of
-from converters.formats.registry import WRITTEN
-from converters.runtimes.agents import AGENTS, CHOSEN, EVERY, SIZES, UNUSUAL, fields_of_agent, fields_with_size
-from exporter.verify.checks.generators import DEPENDENT, likely, wrong_classes
-from exporter.verify.checks.numbers import rank
-from exporter.verify.difference import Difference, wrong
-from exporter.verify.findings import Acting, Bisection, Draws, Finding
-from exporter.verify.participants import Feeds, Participant
-from exporter.verify.statistics import FALSE_ALARM, columns_related, dependent, normal_fit, ranks, same_distribution
-from exporter.verify.tolerances import Tolerance
-from exporter.verify.trial import Trial
-from signatures.code import CodeOptions
-from signatures.masks import random_masks
-from signatures.roles import Role
-from signatures.sampling import Case, draw_rollout
+from export_model.converters.formats.programs.artifact import contract_held
+from export_model.converters.formats.programs.members import Header, header_of
+from export_model.converters.formats.registry import WRITTEN
+from export_model.converters.runtimes.agents import (
+    AGENTS,
+    CHOSEN,
+    EVERY,
+    SIZES,
+    UNUSUAL,
+    fields_of_agent,
+    fields_with_size,
+)
+from export_model.exporter.verify.checks.generators import DEPENDENT, likely, wrong_classes
+from export_model.exporter.verify.checks.numbers import rank
+from export_model.exporter.verify.difference import Difference, wrong
+from export_model.exporter.verify.findings import Acting, Bisection, Draws, Finding
+from export_model.exporter.verify.participants import Feeds, Participant
+from export_model.exporter.verify.statistics import (
+    FALSE_ALARM,
+    columns_related,
+    dependent,
+    normal_fit,
+    ranks,
+    same_distribution,
+)
+from export_model.exporter.verify.tolerances import Tolerance
+from export_model.exporter.verify.trial import Trial
+from export_model.signatures.code import CodeOptions
+from export_model.signatures.masks import random_masks
+from export_model.signatures.roles import Role
+from export_model.signatures.sampling import Case, draw_rollout
 
 Arrays = Mapping[str, np.ndarray]
 ANEW = "an episode that begins with the same seed again does not go as it did"

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from converters.graph.run import run_graph
-from exporter.verify.baked import apply_stated
-from exporter.verify.checks.numbers import rank
-from exporter.verify.findings import Finding, Numbers
-from exporter.verify.trial import Trial
+from export_model.converters.graph.run import run_graph
+from export_model.exporter.verify.baked import apply_stated
+from export_model.exporter.verify.checks.numbers import rank
+from export_model.exporter.verify.findings import Finding, Numbers
+from export_model.exporter.verify.trial import Trial
 
 
 def check_baked(trial: Trial) -> Iterator[Finding]:

@@ -10,8 +10,8 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from exporter.verify.checks.generators import wrong_classes
-from exporter.verify.checks.mixed import (
+from export_model.exporter.verify.checks.generators import wrong_classes
+from export_model.exporter.verify.checks.mixed import (
     DRAWS,
     FEW,
     MIXED,
@@ -22,12 +22,12 @@ from exporter.verify.checks.mixed import (
     places,
     rows_at,
 )
-from exporter.verify.findings import Draws, Finding
-from exporter.verify.participants import Participant
-from exporter.verify.tolerances import Tolerance
-from exporter.verify.trial import Trial
-from signatures.roles import Role
-from signatures.sampling import Case
+from export_model.exporter.verify.findings import Draws, Finding
+from export_model.exporter.verify.participants import Participant
+from export_model.exporter.verify.tolerances import Tolerance
+from export_model.exporter.verify.trial import Trial
+from export_model.signatures.roles import Role
+from export_model.signatures.sampling import Case
 
 
 def classes(trial: Trial, participant: Participant, names: Sequence[str]) -> Iterator[Finding]:

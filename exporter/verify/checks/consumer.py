@@ -6,11 +6,11 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from exporter.verify.findings import Accepted, Finding, Played
-from exporter.verify.tolerances import Tolerance
+from export_model.exporter.verify.findings import Accepted, Finding, Played
+from export_model.exporter.verify.tolerances import Tolerance
 
 if TYPE_CHECKING:
-    from converters.consumers.unity.checker import UnityVerdict
+    from export_model.converters.consumers.unity.checker import UnityVerdict
 
 #: The mode of inference that all releases have: Deterministic Inference off.
 _MODE = "stochastic"
@@ -26,16 +26,16 @@ def consumers(name: str | None, files: Mapping[str, Path], *, memory: bool = Fal
     """
     if name is None:
         return
-    from converters.consumers.profiles import profile
-    from converters.consumers.unity.checker import check_file
-    from converters.consumers.unity.consumers import consumer
-    from converters.formats.registry import ONNX
+    from export_model.converters.consumers.profiles import profile
+    from export_model.converters.consumers.unity.checker import check_file
+    from export_model.converters.consumers.unity.consumers import consumer
+    from export_model.converters.formats.registry import ONNX
 
     wanted = profile(name)
     for loader in wanted.loaders:
-        from converters.consumers.robots.interface import interface_of
-        from converters.consumers.robots.loaders import LOADERS
-        from converters.consumers.unity.onnx_file import read_onnx_file
+        from export_model.converters.consumers.robots.interface import interface_of
+        from export_model.converters.consumers.robots.loaders import LOADERS
+        from export_model.converters.consumers.unity.onnx_file import read_onnx_file
 
         file = interface_of(read_onnx_file(files[ONNX.key]).model)
         faults = [f"{rule.says} ({rule.evidence})" for rule in LOADERS[loader].faults(file)]

@@ -13,16 +13,16 @@ from functools import partial
 
 import numpy as np
 
-from converters.compiler.passes.weights import Storage
-from converters.files.children.process import RunFailedError
-from exporter.verify.findings import Decisions, Finding, failure
-from exporter.verify.participants import Feeds, PolicyUnderTest
-from exporter.verify.reference import Reference
-from exporter.verify.session import Session
-from exporter.verify.tolerances import Tolerance
-from signatures.roles import Role
-from signatures.sampling import Case, draw_typical
-from signatures.spec import PolicySignature
+from export_model.converters.compiler.passes.weights import Storage
+from export_model.converters.files.children.process import RunFailedError
+from export_model.exporter.verify.findings import Decisions, Finding, failure
+from export_model.exporter.verify.participants import Feeds, PolicyUnderTest
+from export_model.exporter.verify.reference import Reference
+from export_model.exporter.verify.session import Session
+from export_model.exporter.verify.tolerances import Tolerance
+from export_model.signatures.roles import Role
+from export_model.signatures.sampling import Case, draw_typical
+from export_model.signatures.spec import PolicySignature
 
 #: The share of choices that may be other ones, and of its spread that a number may move (root mean square). Of 176
 #: public and genuine policies four do not keep int8's (two of them by 8.8% and 11.2%), all keep float16's.

@@ -9,13 +9,13 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from exporter.verify.checks.generators import DEPENDENT, likely
-from exporter.verify.checks.mixed import MIXED, Place, places, rows_at
-from exporter.verify.difference import Difference, wrong
-from exporter.verify.findings import Draws, Finding
-from exporter.verify.participants import Participant
-from exporter.verify.statistics import columns_related, dependent, ranks, same_distribution
-from exporter.verify.trial import Trial
+from export_model.exporter.verify.checks.generators import DEPENDENT, likely
+from export_model.exporter.verify.checks.mixed import MIXED, Place, places, rows_at
+from export_model.exporter.verify.difference import Difference, wrong
+from export_model.exporter.verify.findings import Draws, Finding
+from export_model.exporter.verify.participants import Participant
+from export_model.exporter.verify.statistics import columns_related, dependent, ranks, same_distribution
+from export_model.exporter.verify.trial import Trial
 
 #: Rows of policies that see vectors alone, instead of ``DRAWS``: a spread that is a quarter too wide is seen. So many
 #: pictures or lists of entities do not fit into the memory that a runtime is given.

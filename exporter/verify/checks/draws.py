@@ -14,21 +14,30 @@ from contextlib import closing
 import numpy as np
 from msgspec.structs import replace
 
-from converters.runtimes.pool import RuntimePool
-from converters.runtimes.registry import RUNTIMES
-from exporter.verify.checks.classes import classes
-from exporter.verify.checks.densities import densities
-from exporter.verify.checks.generators import seen_by, wrong_draws
-from exporter.verify.checks.mixed import DRAWS, FEW, MIXED, has_pictures, in_turn, one_row_at_a_time, places, rows_at
-from exporter.verify.checks.numbers import numbers, rank
-from exporter.verify.checks.rollout import rollout
-from exporter.verify.cut import CutArtefact, cut_artefacts
-from exporter.verify.difference import Difference, wrong
-from exporter.verify.findings import Bisection, Draws, Finding, Numbers
-from exporter.verify.participants import Feeds, Participant
-from exporter.verify.trial import Cut, Trial
-from signatures.errors import ExportModelError
-from signatures.roles import Role
+from export_model.converters.runtimes.pool import RuntimePool
+from export_model.converters.runtimes.registry import RUNTIMES
+from export_model.exporter.verify.checks.classes import classes
+from export_model.exporter.verify.checks.densities import densities
+from export_model.exporter.verify.checks.generators import seen_by, wrong_draws
+from export_model.exporter.verify.checks.mixed import (
+    DRAWS,
+    FEW,
+    MIXED,
+    has_pictures,
+    in_turn,
+    one_row_at_a_time,
+    places,
+    rows_at,
+)
+from export_model.exporter.verify.checks.numbers import numbers, rank
+from export_model.exporter.verify.checks.rollout import rollout
+from export_model.exporter.verify.cut import CutArtefact, cut_artefacts
+from export_model.exporter.verify.difference import Difference, wrong
+from export_model.exporter.verify.findings import Bisection, Draws, Finding, Numbers
+from export_model.exporter.verify.participants import Feeds, Participant
+from export_model.exporter.verify.trial import Cut, Trial
+from export_model.signatures.errors import ExportModelError
+from export_model.signatures.roles import Role
 
 Arrays = dict[str, np.ndarray]
 #: Rows that two starts and two calls are compared by, and in how many of them the reference's own two must differ.

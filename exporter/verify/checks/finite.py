@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from exporter.verify.findings import Finding, undecided_finding
-from exporter.verify.trial import Trial
+from export_model.exporter.verify.findings import Finding, undecided_finding
+from export_model.exporter.verify.trial import Trial
 
 
 def check_defined(trial: Trial) -> Iterator[Finding]:

@@ -7,12 +7,12 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from converters.formats.intermediate_tensors import Sampler
-from exporter.verify.checks.mixed import one_row_at_a_time
-from exporter.verify.checks.numbers import rank
-from exporter.verify.difference import Difference, wrong
-from exporter.verify.participants import Participant
-from exporter.verify.statistics import FALSE_ALARM, columns_related, dependent, fit_all, uniform_fit
+from export_model.converters.formats.intermediate_tensors import Sampler
+from export_model.exporter.verify.checks.mixed import one_row_at_a_time
+from export_model.exporter.verify.checks.numbers import rank
+from export_model.exporter.verify.difference import Difference, wrong
+from export_model.exporter.verify.participants import Participant
+from export_model.exporter.verify.statistics import FALSE_ALARM, columns_related, dependent, fit_all, uniform_fit
 
 #: Numbers of a sampler that are looked at, of one that makes many.
 _COLUMNS = 64

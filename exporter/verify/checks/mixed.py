@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from exporter.verify.participants import Participant
-from exporter.verify.trial import Trial
-from signatures.roles import Role
-from signatures.sampling import FAR_CASES, ONE_FORBIDDEN, Case
+from export_model.exporter.verify.participants import Participant
+from export_model.exporter.verify.trial import Trial
+from export_model.signatures.roles import Role
+from export_model.signatures.sampling import FAR_CASES, ONE_FORBIDDEN, Case
 
 #: What a report says was fed.
 MIXED = "rows of many inputs"

@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 from msgspec.structs import replace
 
-from converters.formats.registry import narrows
-from exporter.verify.difference import Difference, add_histograms, wrong
-from exporter.verify.excuses import BOTH_NAN, add_forgiven
-from exporter.verify.findings import Bisection, Finding, Numbers, Shape, undecided_finding
-from exporter.verify.participants import Feeds, Participant
-from exporter.verify.trial import Trial
-from signatures.roles import Role
-from signatures.sampling import HUGE_BATCH, Case
-from signatures.spec import PolicySignature
+from export_model.converters.formats.registry import narrows
+from export_model.exporter.verify.difference import Difference, add_histograms, wrong
+from export_model.exporter.verify.excuses import BOTH_NAN, add_forgiven
+from export_model.exporter.verify.findings import Bisection, Finding, Numbers, Shape, undecided_finding
+from export_model.exporter.verify.participants import Feeds, Participant
+from export_model.exporter.verify.trial import Trial
+from export_model.signatures.roles import Role
+from export_model.signatures.sampling import HUGE_BATCH, Case
+from export_model.signatures.spec import PolicySignature
 
 
 def numbers(trial: Trial, participant: Participant) -> Iterator[Finding]:

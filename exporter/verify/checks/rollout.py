@@ -7,11 +7,11 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from msgspec.structs import replace
 
-from exporter.verify.checks.numbers import largest, rank, sum_differences
-from exporter.verify.difference import Difference
-from exporter.verify.findings import Finding, Rollout
-from exporter.verify.participants import Feeds, Participant
-from exporter.verify.trial import Trial
+from export_model.exporter.verify.checks.numbers import largest, rank, sum_differences
+from export_model.exporter.verify.difference import Difference
+from export_model.exporter.verify.findings import Finding, Rollout
+from export_model.exporter.verify.participants import Feeds, Participant
+from export_model.exporter.verify.trial import Trial
 
 
 def rollout(trial: Trial, participant: Participant) -> Iterator[Finding]:

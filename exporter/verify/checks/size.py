@@ -7,10 +7,10 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from signatures.errors import UsageError
+from export_model.signatures.errors import UsageError
 
 if TYPE_CHECKING:
-    from exporter.verify.findings import Finding
+    from export_model.exporter.verify.findings import Finding
 
 #: All formats of the bundle together.
 TOTAL = "total"
@@ -43,9 +43,9 @@ def check_budget(budget: Mapping[str, int], sizes: Mapping[str, int]) -> None:
 
 def sizes(budget: Mapping[str, int], written: Mapping[str, int]) -> Iterator[Finding]:
     """What each budget says of the bytes that were written."""
-    from exporter.tables import size_text  # a budget is parsed where nothing is verified, too
-    from exporter.verify.findings import Size
-    from exporter.verify.tolerances import Tolerance
+    from export_model.exporter.tables import size_text  # a budget is parsed where nothing is verified, too
+    from export_model.exporter.verify.findings import Size
+    from export_model.exporter.verify.tolerances import Tolerance
 
     found = {**written, TOTAL: sum(written.values())}
     for name, most in budget.items():

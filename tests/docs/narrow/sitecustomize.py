@@ -6,6 +6,6 @@ Python imports this module by its name before the program. A runtime's child (``
 import sys
 
 if "-c" not in sys.orig_argv:
-    from converters.runtimes import pool
+    from export_model.converters.runtimes import pool
 
     pool._ON_REQUEST = frozenset(r.name for r in pool.RUNTIMES if r.name not in ("numpy", "onnxruntime"))

@@ -10,11 +10,11 @@ import numpy.typing as npt
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from converters.compiler.passes.normalise import normalise
-from converters.graph.builder import Builder
-from converters.graph.nodes import NameScope, Node, TensorShape
-from converters.graph.run import run_graph
-from converters.graph.types import BATCH
+from export_model.converters.compiler.passes.normalise import normalise
+from export_model.converters.graph.builder import Builder
+from export_model.converters.graph.nodes import NameScope, Node, TensorShape
+from export_model.converters.graph.run import run_graph
+from export_model.converters.graph.types import BATCH
 from tests import conftest
 from tests.graph.harness import Bindings
 

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from converters.graph.nn import activations as nn
-from converters.graph.nn import trigonometry
+from export_model.converters.graph.nn import activations as nn
+from export_model.converters.graph.nn import trigonometry
 from tests.graph.nn.layers import TOLERANCE, Array, examples, floats, run_one, tensors
 
 _erf = np.vectorize(math.erf, otypes=[float])

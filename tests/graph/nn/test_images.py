@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from converters.graph.builder import Builder
-from converters.graph.nn import pooling
-from converters.graph.nn.convolution import Window, conv2d, conv2d_transposed
-from converters.graph.nodes import NameScope, Node, TensorShape
-from converters.graph.types import FLOAT32
-from signatures.errors import UnsupportedOpError
+from export_model.converters.graph.builder import Builder
+from export_model.converters.graph.nn import pooling
+from export_model.converters.graph.nn.convolution import Window, conv2d, conv2d_transposed
+from export_model.converters.graph.nodes import NameScope, Node, TensorShape
+from export_model.converters.graph.types import FLOAT32
+from export_model.signatures.errors import UnsupportedOpError
 from tests.graph.nn.layers import TOLERANCE, Array, arrays, examples, run_one
 
 H, W, C = 6, 5, 4

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from converters.graph.builder import Builder
-from converters.graph.nn.linear import matmul
+from export_model.converters.graph.builder import Builder
+from export_model.converters.graph.nn.linear import matmul
 from tests.graph.nn.layers import Array, examples, floats, run_one
 
 

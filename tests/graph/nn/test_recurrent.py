@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from converters.graph.nn import recurrent as nn
+from export_model.converters.graph.nn import recurrent as nn
 from tests.graph.nn.layers import TOLERANCE, Array, examples, run
 
 B, N, H = 3, 5, 4

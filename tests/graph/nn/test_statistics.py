@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from converters.graph.nn import normalisation, reduction
+from export_model.converters.graph.nn import normalisation, reduction
 from tests.graph.nn.layers import TOLERANCE, Array, arrays, examples, run, run_one
 
 EPSILON = 1e-2

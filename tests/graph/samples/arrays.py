@@ -6,8 +6,8 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from converters.graph.nodes import Graph, Node, TensorShape
-from converters.graph.types import INT32, INT64
+from export_model.converters.graph.nodes import Graph, Node, TensorShape
+from export_model.converters.graph.types import INT32, INT64
 from tests.graph.samples.base import (
     INF,
     NAN,

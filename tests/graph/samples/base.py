@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 from msgspec.structs import replace
 
-from converters.graph.nodes import Graph, Node, TensorShape, ref
-from converters.graph.types import INT32
+from export_model.converters.graph.nodes import Graph, Node, TensorShape, ref
+from export_model.converters.graph.types import INT32
 from tests.graph.making import defaults
 
 Array = npt.NDArray[Any]

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from converters.graph.types import BOOL, FLOAT32, INT32, INT64
+from export_model.converters.graph.types import BOOL, FLOAT32, INT32, INT64
 from tests.graph.samples.base import (
     EXTREMES,
     HALVES,

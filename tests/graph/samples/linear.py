@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 from msgspec.structs import replace
 
-from converters.graph.nodes import Graph, Node
-from converters.graph.ops.table import TABLE
-from converters.graph.types import INT32
+from export_model.converters.graph.nodes import Graph, Node
+from export_model.converters.graph.ops.table import TABLE
+from export_model.converters.graph.types import INT32
 from tests.graph.making import defaults
 from tests.graph.samples.base import (
     INF,

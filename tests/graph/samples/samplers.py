@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from converters.graph.types import FLOAT32, INT32
+from export_model.converters.graph.types import FLOAT32, INT32
 from tests.graph.samples.base import (
     NO_LOWERING,
     Sample,

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from msgspec import Struct
 
-from converters.runtimes.javascript.node import node_executable
+from export_model.converters.runtimes.javascript.node import node_executable
 
 HERE = Path(__file__).resolve().parent
 WARNINGS = ("-Wall", "-Wextra", "-Wconversion", "-Werror")

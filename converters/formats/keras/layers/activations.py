@@ -8,13 +8,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from converters.formats.keras.layers.step import Step, Translate
-from converters.formats.keras.model import layer_of
-from converters.graph.builder import Builder
-from converters.graph.nn import activations as nn
-from converters.graph.nn.activations import Activation
-from converters.graph.nn.reduction import over_last_axis
-from signatures.errors import UnsupportedOpError
+from export_model.converters.formats.keras.layers.step import Step, Translate
+from export_model.converters.formats.keras.model import layer_of
+from export_model.converters.graph.builder import Builder
+from export_model.converters.graph.nn import activations as nn
+from export_model.converters.graph.nn.activations import Activation
+from export_model.converters.graph.nn.reduction import over_last_axis
+from export_model.signatures.errors import UnsupportedOpError
 
 
 def _softmax(op: str) -> Activation:

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from converters.formats.keras.layers.step import Step
-from converters.graph.types import BOOL, FLOAT32, INT32
-from signatures.errors import UnsupportedOpError
-from signatures.spec import DTYPES
+from export_model.converters.formats.keras.layers.step import Step
+from export_model.converters.graph.types import BOOL, FLOAT32, INT32
+from export_model.signatures.errors import UnsupportedOpError
+from export_model.signatures.spec import DTYPES
 
 #: Elements of a constant that stands among the arguments of a call.
 _MAX_OPERAND = 1 << 16

@@ -8,12 +8,12 @@ from functools import partial
 
 import numpy as np
 
-from converters.formats.keras.layers.step import Step, Translate
-from converters.graph.builder import Builder
-from converters.graph.nn.linear import matmul
-from converters.graph.nn.reduction import over_last_axis
-from converters.graph.types import FLOAT32
-from signatures.errors import UnsupportedOpError
+from export_model.converters.formats.keras.layers.step import Step, Translate
+from export_model.converters.graph.builder import Builder
+from export_model.converters.graph.nn.linear import matmul
+from export_model.converters.graph.nn.reduction import over_last_axis
+from export_model.converters.graph.types import FLOAT32
+from export_model.signatures.errors import UnsupportedOpError
 
 #: What is added to the score of what must not be looked at.
 _HIDDEN = -1e9

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from converters.formats.keras.layers.activations import apply_activation
-from converters.formats.keras.layers.step import Step, Translate
-from converters.graph.nn.convolution import Window, conv2d, conv2d_transposed
-from converters.graph.nn.pooling import average_pool, max_pool
-from signatures.errors import UnsupportedOpError
+from export_model.converters.formats.keras.layers.activations import apply_activation
+from export_model.converters.formats.keras.layers.step import Step, Translate
+from export_model.converters.graph.nn.convolution import Window, conv2d, conv2d_transposed
+from export_model.converters.graph.nn.pooling import average_pool, max_pool
+from export_model.signatures.errors import UnsupportedOpError
 
 Pair = tuple[int, int]
 

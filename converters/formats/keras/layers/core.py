@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from converters.formats.keras.layers.activations import apply_activation
-from converters.formats.keras.layers.step import Step, Translate
-from converters.graph.nn.linear import matmul
-from converters.graph.ops.einsum import einsum
-from converters.graph.types import FLOAT32, INT32, Dim
+from export_model.converters.formats.keras.layers.activations import apply_activation
+from export_model.converters.formats.keras.layers.step import Step, Translate
+from export_model.converters.graph.nn.linear import matmul
+from export_model.converters.graph.ops.einsum import einsum
+from export_model.converters.graph.types import FLOAT32, INT32, Dim
 
 
 def _dense(step: Step) -> str:

@@ -6,11 +6,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from converters.formats.keras.layers.arguments import constant
-from converters.formats.keras.layers.rearranging import one_hot
-from converters.formats.keras.layers.step import Step, Translate
-from converters.graph.types import FLOAT32, INT32
-from signatures.errors import UnsupportedOpError
+from export_model.converters.formats.keras.layers.arguments import constant
+from export_model.converters.formats.keras.layers.rearranging import one_hot
+from export_model.converters.formats.keras.layers.step import Step, Translate
+from export_model.converters.graph.types import FLOAT32, INT32
+from export_model.signatures.errors import UnsupportedOpError
 
 
 def _encode(step: Step, index: str, classes: int, mode: str) -> str:

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from converters.formats.keras.layers.step import Step, Translate
-from converters.graph.nn import normalisation as nn
+from export_model.converters.formats.keras.layers.step import Step, Translate
+from export_model.converters.graph.nn import normalisation as nn
 
 
 def _axes(step: Step, default: int = -1) -> list[int]:

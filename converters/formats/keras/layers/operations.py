@@ -8,9 +8,9 @@ from functools import partial
 
 import numpy as np
 
-from converters.formats.keras.layers import rearranging
-from converters.formats.keras.layers.activations import activation_of, softmax
-from converters.formats.keras.layers.arguments import (
+from export_model.converters.formats.keras.layers import rearranging
+from export_model.converters.formats.keras.layers.activations import activation_of, softmax
+from export_model.converters.formats.keras.layers.arguments import (
     argument,
     as_float,
     axes_of,
@@ -20,14 +20,14 @@ from converters.formats.keras.layers.arguments import (
     named_dtype,
     promote,
 )
-from converters.formats.keras.layers.step import Step, Translate
-from converters.graph.nn import choosing, reduction, trigonometry
-from converters.graph.nn.activations import Activation, celu, clip, elu, leaky_relu, scale_and_shift
-from converters.graph.nn.linear import matmul
-from converters.graph.ops.einsum import einsum
-from converters.graph.ops.table import TABLE
-from converters.graph.types import BOOL, FLOAT32, INT32
-from signatures.errors import UnsupportedOpError
+from export_model.converters.formats.keras.layers.step import Step, Translate
+from export_model.converters.graph.nn import choosing, reduction, trigonometry
+from export_model.converters.graph.nn.activations import Activation, celu, clip, elu, leaky_relu, scale_and_shift
+from export_model.converters.graph.nn.linear import matmul
+from export_model.converters.graph.ops.einsum import einsum
+from export_model.converters.graph.ops.table import TABLE
+from export_model.converters.graph.types import BOOL, FLOAT32, INT32
+from export_model.signatures.errors import UnsupportedOpError
 
 # ------------------------------------------------------------------ each element by itself
 

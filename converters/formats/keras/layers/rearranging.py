@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from converters.formats.keras.layers.arguments import argument, axis_of, constant, named_dtype, promote
-from converters.formats.keras.layers.step import Step, Translate
-from converters.graph.nn.choosing import gather_elements, last, moved_back
-from converters.graph.types import INT32
-from signatures.errors import UnsupportedOpError
+from export_model.converters.formats.keras.layers.arguments import argument, axis_of, constant, named_dtype, promote
+from export_model.converters.formats.keras.layers.step import Step, Translate
+from export_model.converters.graph.nn.choosing import gather_elements, last, moved_back
+from export_model.converters.graph.types import INT32
+from export_model.signatures.errors import UnsupportedOpError
 
 #: ``numpy.pad``'s modes that repeat elements, which TensorFlow has too.
 _MIRRORS = ("reflect", "symmetric")

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from msgspec import Struct
 
-from converters.formats.keras.layers.activations import activation_of
-from converters.formats.keras.layers.step import Step, Translate
-from converters.formats.keras.model import Layer, cells_of, layer_of
-from converters.graph.nn import recurrent as nn
-from converters.graph.nn.activations import Activation
-from converters.graph.types import FLOAT32
-from signatures.errors import DamagedFileError, UnsupportedOpError
+from export_model.converters.formats.keras.layers.activations import activation_of
+from export_model.converters.formats.keras.layers.step import Step, Translate
+from export_model.converters.formats.keras.model import Layer, cells_of, layer_of
+from export_model.converters.graph.nn import recurrent as nn
+from export_model.converters.graph.nn.activations import Activation
+from export_model.converters.graph.types import FLOAT32
+from export_model.signatures.errors import DamagedFileError, UnsupportedOpError
 
 #: (x [B, n], states) → the new states; the first is what the cell gives.
 Turn = Callable[[str, Sequence[str]], list[str]]

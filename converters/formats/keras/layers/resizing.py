@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from converters.formats.keras.layers.step import Step, Translate
-from converters.graph.nn.resizing import Resampling, resample
-from converters.graph.types import FLOAT32
-from signatures.errors import UnsupportedOpError
+from export_model.converters.formats.keras.layers.step import Step, Translate
+from export_model.converters.graph.nn.resizing import Resampling, resample
+from export_model.converters.graph.types import FLOAT32
+from export_model.signatures.errors import UnsupportedOpError
 
 #: tf.image.resize, pixels in their middle, by ONNX's names. Its bicubic has weights from a table of 1024 (1e-3 off).
 _RESAMPLING = {

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from converters.formats.keras.model import Layer
-from converters.graph.types import FLOAT32
-from signatures.errors import DamagedFileError, UnsupportedOpError
+from export_model.converters.formats.keras.model import Layer
+from export_model.converters.graph.types import FLOAT32
+from export_model.signatures.errors import DamagedFileError, UnsupportedOpError
 
 if TYPE_CHECKING:
-    from converters.formats.keras.network import Network
+    from export_model.converters.formats.keras.network import Network
 
 Translate = Callable[["Step"], "str | Sequence[str]"]
 

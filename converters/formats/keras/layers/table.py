@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from converters.formats.keras.layers import (
+from export_model.converters.formats.keras.layers import (
     activations,
     attention,
     convolution,
@@ -17,9 +17,9 @@ from converters.formats.keras.layers import (
     recurrent,
     resizing,
 )
-from converters.formats.keras.layers.step import Step, Translate
-from converters.formats.keras.model import layer_of
-from signatures.errors import UnsupportedOpError
+from export_model.converters.formats.keras.layers.step import Step, Translate
+from export_model.converters.formats.keras.model import layer_of
+from export_model.signatures.errors import UnsupportedOpError
 
 
 def _call_wrapped(step: Step, x: str) -> str:

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from converters.formats.litert.importer.elementwise import add_activation
-from converters.formats.litert.importer.importer import Importer
-from converters.formats.litert.importer.operator import Op, Translate
-from converters.graph.nn import choosing as nn
-from converters.graph.nodes import ref
-from converters.graph.types import INT32
+from export_model.converters.formats.litert.importer.elementwise import add_activation
+from export_model.converters.formats.litert.importer.importer import Importer
+from export_model.converters.formats.litert.importer.operator import Op, Translate
+from export_model.converters.graph.nn import choosing as nn
+from export_model.converters.graph.nodes import ref
+from export_model.converters.graph.types import INT32
 
 _REDUCTIONS = {
     "MEAN": "Mean",

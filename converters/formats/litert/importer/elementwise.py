@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from converters.formats.litert.importer.importer import Importer
-from converters.formats.litert.importer.operator import Op, Translate
-from converters.formats.litert.schema import ACTIVATIONS
-from converters.graph.builder import Builder
-from converters.graph.nn import activations as nn
-from converters.graph.nn.normalisation import unit_length
+from export_model.converters.formats.litert.importer.importer import Importer
+from export_model.converters.formats.litert.importer.operator import Op, Translate
+from export_model.converters.formats.litert.schema import ACTIVATIONS
+from export_model.converters.graph.builder import Builder
+from export_model.converters.graph.nn import activations as nn
+from export_model.converters.graph.nn.normalisation import unit_length
 
 #: Operators that take what the op takes, and mean the same.
 _SAME = {

@@ -6,15 +6,15 @@ from collections.abc import Collection, Mapping
 
 import numpy as np
 
-from converters.formats.litert.flatbuffer import Table
-from converters.formats.litert.importer.operator import Op, Translate
-from converters.formats.litert.tensors import UNNAMED, Tensors, damaged_error
-from converters.formats.onnx.importer.importer import node_name
-from converters.graph.builder import Builder
-from converters.graph.nn.dilation import Blocks
-from converters.graph.nodes import NameScope, Node, TensorShape, ref
-from converters.graph.ops.base import MISFIT
-from signatures.errors import UnsupportedOpError
+from export_model.converters.formats.litert.flatbuffer import Table
+from export_model.converters.formats.litert.importer.operator import Op, Translate
+from export_model.converters.formats.litert.tensors import UNNAMED, Tensors, damaged_error
+from export_model.converters.formats.onnx.importer.importer import node_name
+from export_model.converters.graph.builder import Builder
+from export_model.converters.graph.nn.dilation import Blocks
+from export_model.converters.graph.nodes import NameScope, Node, TensorShape, ref
+from export_model.converters.graph.ops.base import MISFIT
+from export_model.signatures.errors import UnsupportedOpError
 
 #: Operators with weights, and the axes of these as TensorFlow has them: (columns, rows), (height, width, in, out).
 KERNELS = {"FULLY_CONNECTED": (1, 0), "CONV_2D": (1, 2, 3, 0)}

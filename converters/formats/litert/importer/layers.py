@@ -7,14 +7,20 @@ from typing import Any
 
 import numpy as np
 
-from converters.formats.litert.importer.elementwise import add_activation
-from converters.formats.litert.importer.importer import KERNELS, Importer
-from converters.formats.litert.importer.operator import Op, Translate
-from converters.formats.litert.schema import PADDINGS
-from converters.graph.nn.convolution import Window, conv2d, conv2d_transposed, transposed_window
-from converters.graph.nn.dilation import Blocks, batch_to_space, blocks_of, convolve_dilated, space_to_batch
-from converters.graph.ops.blocks import find_convolution
-from converters.graph.ops.transposed import result_lengths
+from export_model.converters.formats.litert.importer.elementwise import add_activation
+from export_model.converters.formats.litert.importer.importer import KERNELS, Importer
+from export_model.converters.formats.litert.importer.operator import Op, Translate
+from export_model.converters.formats.litert.schema import PADDINGS
+from export_model.converters.graph.nn.convolution import Window, conv2d, conv2d_transposed, transposed_window
+from export_model.converters.graph.nn.dilation import (
+    Blocks,
+    batch_to_space,
+    blocks_of,
+    convolve_dilated,
+    space_to_batch,
+)
+from export_model.converters.graph.ops.blocks import find_convolution
+from export_model.converters.graph.ops.transposed import result_lengths
 
 _PADDING = {number: name for name, number in PADDINGS.items()}
 

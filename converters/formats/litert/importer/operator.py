@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from msgspec import Struct
 
-from signatures.errors import UnsupportedOpError
+from export_model.signatures.errors import UnsupportedOpError
 
 if TYPE_CHECKING:
-    from converters.formats.litert.importer.importer import Importer
+    from export_model.converters.formats.litert.importer.importer import Importer
 
 
 class Op(Struct, frozen=True):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from converters.formats.litert.importer import arrays, elementwise, layers
-from converters.formats.litert.importer.operator import Translate
+from export_model.converters.formats.litert.importer import arrays, elementwise, layers
+from export_model.converters.formats.litert.importer.operator import Translate
 
 TABLE: Mapping[str, Translate] = {**arrays.OPS, **elementwise.OPS, **layers.OPS}

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from converters.formats.onnx.importer.importer import Importer
-from converters.formats.onnx.importer.node import Op, Translate
-from converters.graph.types import FLOAT32, INT64, Dim, product
+from export_model.converters.formats.onnx.importer.importer import Importer
+from export_model.converters.formats.onnx.importer.node import Op, Translate
+from export_model.converters.graph.types import FLOAT32, INT64, Dim, product
 
 #: Constants that a few bytes of the model make may not be larger.
 MAX_ELEMENTS = 1 << 22

@@ -7,11 +7,11 @@ from typing import cast
 
 import numpy as np
 
-from converters.formats.onnx.importer.importer import Importer
-from converters.formats.onnx.importer.node import Op, Translate
-from converters.graph.nn import choosing as nn
-from converters.graph.types import BOOL, INT32, Dim
-from signatures.errors import UnsupportedOpError
+from export_model.converters.formats.onnx.importer.importer import Importer
+from export_model.converters.formats.onnx.importer.node import Op, Translate
+from export_model.converters.graph.nn import choosing as nn
+from export_model.converters.graph.types import BOOL, INT32, Dim
+from export_model.signatures.errors import UnsupportedOpError
 
 _COMBINED = ("none", "add", "mul", "max", "min")
 

@@ -10,11 +10,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from msgspec.structs import replace
 
-from converters.formats.onnx.importer.importer import Importer
-from converters.formats.onnx.importer.node import Op, Translate
-from converters.graph.nn import convolution as nn
-from converters.graph.nn import pooling
-from converters.graph.nn.convolution import Pair, Window
+from export_model.converters.formats.onnx.importer.importer import Importer
+from export_model.converters.formats.onnx.importer.node import Op, Translate
+from export_model.converters.graph.nn import convolution as nn
+from export_model.converters.graph.nn import pooling
+from export_model.converters.graph.nn.convolution import Pair, Window
 
 _TO_NHWC, _TO_NCHW = (0, 2, 3, 1), (0, 3, 1, 2)
 _IMAGE = 4

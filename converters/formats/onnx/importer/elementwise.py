@@ -9,12 +9,12 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from converters.formats.onnx.importer.importer import Importer
-from converters.formats.onnx.importer.node import Op, Translate
-from converters.graph.builder import Builder
-from converters.graph.nn import activations as nn
-from converters.graph.nn import trigonometry
-from converters.graph.ops.table import op_of
+from export_model.converters.formats.onnx.importer.importer import Importer
+from export_model.converters.formats.onnx.importer.node import Op, Translate
+from export_model.converters.graph.builder import Builder
+from export_model.converters.graph.nn import activations as nn
+from export_model.converters.graph.nn import trigonometry
+from export_model.converters.graph.ops.table import op_of
 
 #: Ops that mean the same under another name, and take the same inputs.
 _SAME = {

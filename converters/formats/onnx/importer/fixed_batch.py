@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 from msgspec import Struct
 
-from converters.graph.types import BATCH, Dim, Symbols
+from export_model.converters.graph.types import BATCH, Dim, Symbols
 
 
 class Axis(Struct, frozen=True):

@@ -9,16 +9,16 @@ from typing import Any
 import numpy as np
 from msgspec.structs import replace
 
-from converters.files.external_data import Detached
-from converters.formats.onnx.importer.fixed_batch import FixedBatch
-from converters.formats.onnx.importer.node import STANDARD, Op, Translate
-from converters.formats.onnx.proto import array_of, attribute_of
-from converters.graph.builder import Builder
-from converters.graph.nodes import MAX_NAME, NameScope, Node, TensorShape
-from converters.graph.ops.base import MISFIT
-from converters.graph.ops.table import op_of
-from converters.graph.types import FLOAT32, TensorType
-from signatures.errors import DamagedFileError, UnsupportedOpError
+from export_model.converters.files.external_data import Detached
+from export_model.converters.formats.onnx.importer.fixed_batch import FixedBatch
+from export_model.converters.formats.onnx.importer.node import STANDARD, Op, Translate
+from export_model.converters.formats.onnx.proto import array_of, attribute_of
+from export_model.converters.graph.builder import Builder
+from export_model.converters.graph.nodes import MAX_NAME, NameScope, Node, TensorShape
+from export_model.converters.graph.ops.base import MISFIT
+from export_model.converters.graph.ops.table import op_of
+from export_model.converters.graph.types import FLOAT32, TensorType
+from export_model.signatures.errors import DamagedFileError, UnsupportedOpError
 
 
 def node_name(value: str) -> str:

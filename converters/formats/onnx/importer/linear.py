@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from converters.formats.onnx.importer.elementwise import is_bias
-from converters.formats.onnx.importer.importer import Importer
-from converters.formats.onnx.importer.node import Op, Translate
-from converters.graph.nn import reduction
-from converters.graph.nn.choosing import last, moved_back
-from converters.graph.nn.linear import matmul
-from converters.graph.ops.einsum import einsum, labels_of
-from converters.graph.types import INT64, Dim, product
+from export_model.converters.formats.onnx.importer.elementwise import is_bias
+from export_model.converters.formats.onnx.importer.importer import Importer
+from export_model.converters.formats.onnx.importer.node import Op, Translate
+from export_model.converters.graph.nn import reduction
+from export_model.converters.graph.nn.choosing import last, moved_back
+from export_model.converters.graph.nn.linear import matmul
+from export_model.converters.graph.ops.einsum import einsum, labels_of
+from export_model.converters.graph.types import INT64, Dim, product
 
 _MATRIX = 2
 

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from msgspec import Struct
 
-from converters.graph.types import FLOAT32
-from signatures.dtypes import DATA_TYPES
-from signatures.errors import UnsupportedOpError
+from export_model.converters.graph.types import FLOAT32
+from export_model.signatures.dtypes import DATA_TYPES
+from export_model.signatures.errors import UnsupportedOpError
 
 if TYPE_CHECKING:
-    from converters.formats.onnx.importer.importer import Importer
+    from export_model.converters.formats.onnx.importer.importer import Importer
 
 #: Domains that mean ONNX's own operators.
 STANDARD = ("", "ai.onnx")

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from converters.formats.onnx.importer.importer import Importer
-from converters.formats.onnx.importer.node import Op, Translate
-from converters.graph.nn import normalisation as nn
+from export_model.converters.formats.onnx.importer.importer import Importer
+from export_model.converters.formats.onnx.importer.node import Op, Translate
+from export_model.converters.graph.nn import normalisation as nn
 
 
 def _epsilon(op: Op) -> float:

@@ -10,10 +10,10 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from msgspec import Struct
 
-from converters.formats.onnx.importer.importer import Importer
-from converters.formats.onnx.importer.node import Op, Translate
-from converters.graph.nn import recurrent as nn
-from converters.graph.types import FLOAT32, Dim
+from export_model.converters.formats.onnx.importer.importer import Importer
+from export_model.converters.formats.onnx.importer.node import Op, Translate
+from export_model.converters.graph.nn import recurrent as nn
+from export_model.converters.graph.types import FLOAT32, Dim
 
 _DEFAULTS = {
     "LSTM": ("sigmoid", "tanh", "tanh"),

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from converters.formats.onnx.importer.importer import Importer
-from converters.formats.onnx.importer.node import Op, Translate
-from converters.graph.nn.resizing import Resampling, resample
-from converters.graph.types import Dim
+from export_model.converters.formats.onnx.importer.importer import Importer
+from export_model.converters.formats.onnx.importer.node import Op, Translate
+from export_model.converters.graph.nn.resizing import Resampling, resample
+from export_model.converters.graph.types import Dim
 
 _IMAGE = 4
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from converters.formats.onnx.importer.importer import Importer
-from converters.formats.onnx.importer.node import Op, Translate
-from converters.graph.nn.activations import scale_and_shift
-from converters.graph.types import BATCH, FLOAT32, INT32
+from export_model.converters.formats.onnx.importer.importer import Importer
+from export_model.converters.formats.onnx.importer.node import Op, Translate
+from export_model.converters.graph.nn.activations import scale_and_shift
+from export_model.converters.graph.types import BATCH, FLOAT32, INT32
 
 
 def _shape(op: Op, net: Importer) -> str:

@@ -7,9 +7,9 @@ from typing import Literal, cast
 
 import numpy as np
 
-from converters.formats.onnx.importer.importer import Importer
-from converters.formats.onnx.importer.node import Op, Translate
-from converters.graph.types import INT32, INT64, Dim
+from export_model.converters.formats.onnx.importer.importer import Importer
+from export_model.converters.formats.onnx.importer.node import Op, Translate
+from export_model.converters.graph.types import INT32, INT64, Dim
 
 #: Beyond this an index means "to the end", in the 32-bit numbers that all targets have.
 _END = 2**31 - 1

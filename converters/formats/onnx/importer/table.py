@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from converters.formats.onnx.importer import (
+from export_model.converters.formats.onnx.importer import (
     arrays,
     choosing,
     control_flow,
@@ -17,7 +17,7 @@ from converters.formats.onnx.importer import (
     samplers,
     slicing,
 )
-from converters.formats.onnx.importer.node import Translate
+from export_model.converters.formats.onnx.importer.node import Translate
 
 _MODULES = (
     *(arrays, choosing, control_flow, convolution, elementwise, linear),

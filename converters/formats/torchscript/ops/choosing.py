@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from converters.formats.torchscript.machine import Machine
-from converters.formats.torchscript.values import Tensor
-from converters.graph.nn import choosing
-from converters.graph.ops.einsum import einsum
-from converters.graph.types import FLOAT32, INT64
-from signatures.errors import UnsupportedOpError
+from export_model.converters.formats.torchscript.machine import Machine
+from export_model.converters.formats.torchscript.values import Tensor
+from export_model.converters.graph.nn import choosing
+from export_model.converters.graph.ops.einsum import einsum
+from export_model.converters.graph.types import FLOAT32, INT64
+from export_model.signatures.errors import UnsupportedOpError
 
 
 def _embedding(m: Machine, weight: Any, indices: Any, *rest: Any) -> Tensor:

@@ -7,13 +7,13 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
-from converters.formats.torchscript.machine import Machine, unknown_length
-from converters.formats.torchscript.ops.scalars import NUMBERS, join_lists
-from converters.formats.torchscript.values import LengthFoundError, OpenLength, Tensor
-from converters.graph.nn import activations, trigonometry
-from converters.graph.nn.activations import Activation
-from converters.graph.types import BOOL, FLOAT32
-from signatures.errors import UnsupportedOpError
+from export_model.converters.formats.torchscript.machine import Machine, unknown_length
+from export_model.converters.formats.torchscript.ops.scalars import NUMBERS, join_lists
+from export_model.converters.formats.torchscript.values import LengthFoundError, OpenLength, Tensor
+from export_model.converters.graph.nn import activations, trigonometry
+from export_model.converters.graph.nn.activations import Activation
+from export_model.converters.graph.types import BOOL, FLOAT32
+from export_model.signatures.errors import UnsupportedOpError
 
 
 def _floats(m: Machine, x: Any) -> str:

@@ -7,10 +7,10 @@ from typing import Any, Literal, cast
 
 import numpy as np
 
-from converters.formats.torchscript.machine import Machine
-from converters.formats.torchscript.values import Tensor
-from converters.graph.nn.resizing import Resampling, resample
-from signatures.errors import UnsupportedOpError
+from export_model.converters.formats.torchscript.machine import Machine
+from export_model.converters.formats.torchscript.values import Tensor
+from export_model.converters.graph.nn.resizing import Resampling, resample
+from export_model.signatures.errors import UnsupportedOpError
 
 _FIRST = 2  # a batch and channels go before the axes of an image
 

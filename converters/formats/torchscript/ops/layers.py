@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from converters.formats.torchscript.machine import Machine
-from converters.formats.torchscript.values import Tensor
-from converters.graph.nn import normalisation, pooling
-from converters.graph.nn.activations import scale_and_shift
-from converters.graph.nn.convolution import Window, conv2d, conv2d_transposed
-from converters.graph.nn.linear import matmul
-from converters.graph.types import BOOL, FLOAT32
-from signatures.errors import UnsupportedOpError
+from export_model.converters.formats.torchscript.machine import Machine
+from export_model.converters.formats.torchscript.values import Tensor
+from export_model.converters.graph.nn import normalisation, pooling
+from export_model.converters.graph.nn.activations import scale_and_shift
+from export_model.converters.graph.nn.convolution import Window, conv2d, conv2d_transposed
+from export_model.converters.graph.nn.linear import matmul
+from export_model.converters.graph.types import BOOL, FLOAT32
+from export_model.signatures.errors import UnsupportedOpError
 
 
 def _linear(m: Machine, x: Any, weight: Any, bias: Any = None) -> Tensor:

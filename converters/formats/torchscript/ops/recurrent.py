@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from converters.formats.torchscript.machine import Machine
-from converters.formats.torchscript.values import Tensor
-from converters.graph.nn import recurrent as nn
-from signatures.errors import UnsupportedOpError
+from export_model.converters.formats.torchscript.machine import Machine
+from export_model.converters.formats.torchscript.values import Tensor
+from export_model.converters.graph.nn import recurrent as nn
+from export_model.signatures.errors import UnsupportedOpError
 
 #: Steps that a history may have: each is written out.
 _MAX_STEPS = 128

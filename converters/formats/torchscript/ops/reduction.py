@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from converters.formats.torchscript.machine import Machine
-from converters.formats.torchscript.values import Tensor
-from converters.graph.nn.reduction import over_last_axis
-from converters.graph.types import FLOAT32, INT64
-from signatures.errors import UnsupportedOpError
+from export_model.converters.formats.torchscript.machine import Machine
+from export_model.converters.formats.torchscript.values import Tensor
+from export_model.converters.graph.nn.reduction import over_last_axis
+from export_model.converters.graph.types import FLOAT32, INT64
+from export_model.signatures.errors import UnsupportedOpError
 
 
 def _axes(m: Machine, x: str, dim: Any) -> list[int]:

@@ -6,10 +6,10 @@ import operator
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from converters.formats.torchscript.machine import DTYPES, Machine
-from converters.formats.torchscript.values import Device, Tensor
-from converters.graph.types import BOOL, FLOAT32, INT64
-from signatures.errors import SourceError, UnsupportedOpError
+from export_model.converters.formats.torchscript.machine import DTYPES, Machine
+from export_model.converters.formats.torchscript.values import Device, Tensor
+from export_model.converters.graph.types import BOOL, FLOAT32, INT64
+from export_model.signatures.errors import SourceError, UnsupportedOpError
 
 #: Names that stand without ``torch.``.
 BARE = frozenset(("int", "float", "bool", "range"))

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from msgspec.structs import replace
 
-from converters.formats.torchscript.machine import Machine, unknown_length
-from converters.formats.torchscript.ops.scalars import dtype_of
-from converters.formats.torchscript.values import OpenLength, Put, Show, Tensor, View
-from converters.graph.types import FLOAT32, INT64, Dim
-from signatures.errors import UnsupportedOpError
+from export_model.converters.formats.torchscript.machine import Machine, unknown_length
+from export_model.converters.formats.torchscript.ops.scalars import dtype_of
+from export_model.converters.formats.torchscript.values import OpenLength, Put, Show, Tensor, View
+from export_model.converters.graph.types import FLOAT32, INT64, Dim
+from export_model.signatures.errors import UnsupportedOpError
 
 #: What stands for "to the end" in a slice.
 _END = (1 << 63) - 1

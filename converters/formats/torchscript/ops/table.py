@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from converters.formats.torchscript.ops import (
+from export_model.converters.formats.torchscript.ops import (
     choosing,
     elementwise,
     images,

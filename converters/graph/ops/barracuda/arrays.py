@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 from msgspec.structs import replace
 
-from converters.graph.nodes import ref
-from converters.graph.ops.barracuda.base import NONE, Nn
-from converters.graph.ops.barracuda.builder import NnBuilder
-from converters.graph.ops.barracuda.values import Axes, Value, rows_first, usual_axes
-from converters.graph.ops.barracuda.vocabulary import C, H, LayerType, N, W
-from converters.graph.types import BATCH, Dim
+from export_model.converters.graph.nodes import ref
+from export_model.converters.graph.ops.barracuda.base import NONE, Nn
+from export_model.converters.graph.ops.barracuda.builder import NnBuilder
+from export_model.converters.graph.ops.barracuda.values import Axes, Value, rows_first, usual_axes
+from export_model.converters.graph.ops.barracuda.vocabulary import C, H, LayerType, N, W
+from export_model.converters.graph.types import BATCH, Dim
 
 #: What is refused, and why.
 _CUTS_AGENTS = "it cuts agents out of the batch", "a policy answers for every agent"

@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 
 from msgspec import Struct
 
-from converters.graph.ops.barracuda.builder import NnBuilder
-from converters.graph.ops.barracuda.values import Value
-from converters.graph.ops.barracuda.vocabulary import Activation, LayerType
+from export_model.converters.graph.ops.barracuda.builder import NnBuilder
+from export_model.converters.graph.ops.barracuda.values import Value
+from export_model.converters.graph.ops.barracuda.vocabulary import Activation, LayerType
 
 #: The values of an op's data as the value of its result, or of each.
 Lower = Callable[[NnBuilder, Sequence[Value]], "Value | tuple[Value, ...]"]

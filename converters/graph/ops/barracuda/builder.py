@@ -13,13 +13,13 @@ import numpy.typing as npt
 from msgspec import Struct
 from msgspec.structs import replace
 
-from converters.graph.nn.choosing import MAX_TABLE
-from converters.graph.nodes import NameScope, Node
-from converters.graph.ops.barracuda.values import FREE, Array, Axes, Dims, Piece, Value, usual_axes
-from converters.graph.ops.barracuda.vocabulary import Activation, C, LayerType, N
-from converters.graph.size_limits import MAX_MADE, Allowance
-from converters.graph.types import BATCH, Dim, TensorType
-from signatures.errors import UnsupportedOpError
+from export_model.converters.graph.nn.choosing import MAX_TABLE
+from export_model.converters.graph.nodes import NameScope, Node
+from export_model.converters.graph.ops.barracuda.values import FREE, Array, Axes, Dims, Piece, Value, usual_axes
+from export_model.converters.graph.ops.barracuda.vocabulary import Activation, C, LayerType, N
+from export_model.converters.graph.size_limits import MAX_MADE, Allowance
+from export_model.converters.graph.types import BATCH, Dim, TensorType
+from export_model.signatures.errors import UnsupportedOpError
 
 #: Tensors that a tensor is joined from.
 MAX_PIECES = 1 << 10

@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from converters.graph.nn.choosing import MAX_TABLE
-from converters.graph.nodes import Node, ref
-from converters.graph.ops.base import axis_within
-from converters.graph.ops.rewriting import Decomposition, GraphBuilder, Tfjs
-from converters.graph.types import BATCH, BOOL, FLOAT32, INT32, TensorType
-from signatures.errors import UnsupportedOpError
+from export_model.converters.graph.nn.choosing import MAX_TABLE
+from export_model.converters.graph.nodes import Node, ref
+from export_model.converters.graph.ops.base import axis_within
+from export_model.converters.graph.ops.rewriting import Decomposition, GraphBuilder, Tfjs
+from export_model.converters.graph.types import BATCH, BOOL, FLOAT32, INT32, TensorType
+from export_model.signatures.errors import UnsupportedOpError
 
 #: Times this, every difference that float32 tells apart from 0 near 1 is beyond ±1.
 _STEEP = 1e30

@@ -13,11 +13,11 @@ from functools import partial
 
 import numpy as np
 
-from converters.graph.ops.barracuda.base import Nn
-from converters.graph.ops.barracuda.builder import NnBuilder
-from converters.graph.ops.barracuda.values import Axes, Value, usual_axes
-from converters.graph.ops.barracuda.vocabulary import Activation, C, H, LayerType, W
-from converters.graph.types import Dim
+from export_model.converters.graph.ops.barracuda.base import Nn
+from export_model.converters.graph.ops.barracuda.builder import NnBuilder
+from export_model.converters.graph.ops.barracuda.values import Axes, Value, usual_axes
+from export_model.converters.graph.ops.barracuda.vocabulary import Activation, C, H, LayerType, W
+from export_model.converters.graph.types import Dim
 
 _MIRRORED: Mapping[LayerType, LayerType] = {
     LayerType.GREATER: LayerType.LESS,

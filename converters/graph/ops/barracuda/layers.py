@@ -12,12 +12,12 @@ from functools import partial
 
 import numpy as np
 
-from converters.graph.ops.barracuda.base import FIRST, NONE, Nn
-from converters.graph.ops.barracuda.builder import NnBuilder
-from converters.graph.ops.barracuda.elementwise import apply_activation
-from converters.graph.ops.barracuda.values import Value
-from converters.graph.ops.barracuda.vocabulary import Activation, C, LayerType, N
-from converters.graph.types import BATCH
+from export_model.converters.graph.ops.barracuda.base import FIRST, NONE, Nn
+from export_model.converters.graph.ops.barracuda.builder import NnBuilder
+from export_model.converters.graph.ops.barracuda.elementwise import apply_activation
+from export_model.converters.graph.ops.barracuda.values import Value
+from export_model.converters.graph.ops.barracuda.vocabulary import Activation, C, LayerType, N
+from export_model.converters.graph.types import BATCH
 
 #: A first pad of −1 is TensorFlow's SAME.
 _SAME = (-1,)

@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
-from converters.graph.ops.barracuda.vocabulary import C, N
-from converters.graph.types import BATCH, Dim
+from export_model.converters.graph.ops.barracuda.vocabulary import C, N
+from export_model.converters.graph.types import BATCH, Dim
 
 Array = npt.NDArray[np.float32]
 #: Where each axis of a tensor of the graph lies: N, H, W or C; None: nowhere, its length is 1.

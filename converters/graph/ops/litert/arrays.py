@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from converters.graph.nodes import Node, ref
-from converters.graph.ops.litert.base import (
+from export_model.converters.graph.nodes import Node, ref
+from export_model.converters.graph.ops.litert.base import (
     Litert,
     LitertBuilder,
     Value,
@@ -15,7 +15,7 @@ from converters.graph.ops.litert.base import (
     litert_error,
     with_axis,
 )
-from converters.graph.types import FLOAT32, INT32, INT64, TensorType
+from export_model.converters.graph.types import FLOAT32, INT32, INT64, TensorType
 
 
 def shape(node: Node, builder: LitertBuilder) -> Value:

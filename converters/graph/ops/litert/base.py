@@ -12,9 +12,9 @@ from typing import Any, Protocol
 import numpy as np
 from msgspec import Struct
 
-from converters.graph.nodes import Node
-from converters.graph.types import INT32, INT64, Dim, TensorType
-from signatures.errors import UnsupportedOpError
+from export_model.converters.graph.nodes import Node
+from export_model.converters.graph.types import INT32, INT64, Dim, TensorType
+from export_model.signatures.errors import UnsupportedOpError
 
 #: The number of a tensor in the file; that of an operand which is not there.
 Value = int

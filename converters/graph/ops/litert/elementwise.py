@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from converters.graph.nodes import Node
-from converters.graph.ops.litert.base import Litert, LitertBuilder, Value, number
-from converters.graph.types import BOOL, FLOAT32, INT32, INT64, TensorType
+from export_model.converters.graph.nodes import Node
+from export_model.converters.graph.ops.litert.base import Litert, LitertBuilder, Value, number
+from export_model.converters.graph.types import BOOL, FLOAT32, INT32, INT64, TensorType
 
 
 def square(node: Node, builder: LitertBuilder) -> Value:

@@ -7,8 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from converters.graph.nodes import Node
-from converters.graph.ops.litert.base import NONE, Litert, LitertBuilder, Operator, Value, as_int32, litert_error
+from export_model.converters.graph.nodes import Node
+from export_model.converters.graph.ops.litert.base import (
+    NONE,
+    Litert,
+    LitertBuilder,
+    Operator,
+    Value,
+    as_int32,
+    litert_error,
+)
 
 #: The axes of a kernel as LiteRT has them.
 _FIRST = (3, 0, 1, 2)

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from converters.graph.nodes import Node, ref
-from converters.graph.ops.loops.base import (
+from export_model.converters.graph.nodes import Node, ref
+from export_model.converters.graph.ops.loops.base import (
     Element,
     Expression,
     Index,
@@ -24,7 +24,7 @@ from converters.graph.ops.loops.base import (
     select_expression,
     shape_of,
 )
-from converters.graph.types import INT32
+from export_model.converters.graph.types import INT32
 
 
 def constant_operand(node: Node, builder: LoopBuilder, position: int) -> np.ndarray:

@@ -13,9 +13,9 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from msgspec import Struct
 
-from converters.graph.nodes import Node
-from converters.graph.types import BOOL, FLOAT32, INT32, INT64, TensorType
-from signatures.errors import UnsupportedOpError
+from export_model.converters.graph.nodes import Node
+from export_model.converters.graph.types import BOOL, FLOAT32, INT32, INT64, TensorType
+from export_model.signatures.errors import UnsupportedOpError
 
 #: Every function that an expression may apply; an emitter has a row for each.
 FUNCTIONS = frozenset(

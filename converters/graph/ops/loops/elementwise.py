@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from converters.graph.nodes import Node
-from converters.graph.ops.loops.base import (
+from export_model.converters.graph.nodes import Node
+from export_model.converters.graph.ops.loops.base import (
     Elementwise,
     Expression,
     LoopBuilder,
@@ -18,7 +18,7 @@ from converters.graph.ops.loops.base import (
     select_expression,
     shape_of,
 )
-from converters.graph.types import BOOL
+from export_model.converters.graph.types import BOOL
 
 
 def _like(x: Expression, value: float) -> Number:

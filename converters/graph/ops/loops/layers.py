@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from converters.graph.nodes import Node
-from converters.graph.ops.loops.base import (
+from export_model.converters.graph.nodes import Node
+from export_model.converters.graph.ops.loops.base import (
     Drawn,
     Element,
     Elementwise,
@@ -27,8 +27,8 @@ from converters.graph.ops.loops.base import (
     select_expression,
     shape_of,
 )
-from converters.graph.ops.loops.elementwise import apply_activations
-from converters.graph.types import BOOL, INT32
+from export_model.converters.graph.ops.loops.elementwise import apply_activations
+from export_model.converters.graph.types import BOOL, INT32
 
 
 def _mul(a: Expression, b: Expression) -> Expression:

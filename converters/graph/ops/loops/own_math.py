@@ -12,8 +12,8 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from msgspec import Struct
 
-from converters.graph.ops.loops.base import Expression, Number, apply, holds, number, select_expression
-from converters.graph.types import FLOAT32, INT32
+from export_model.converters.graph.ops.loops.base import Expression, Number, apply, holds, number, select_expression
+from export_model.converters.graph.types import FLOAT32, INT32
 
 
 class Own(Struct, frozen=True):

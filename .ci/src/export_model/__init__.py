@@ -13,19 +13,19 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
-    from exporter import __version__
-    from exporter.interface import compare, export, inspect, load, play, verify
-    from exporter.options import ReadOptions, WriteOptions
-    from exporter.play.options import PlayOptions
-    from exporter.verify.options import VerifyOptions
-    from signatures.errors import ExportModelError, ParityError
+    from export_model.exporter import __version__
+    from export_model.exporter.interface import compare, export, inspect, load, play, verify
+    from export_model.exporter.options import ReadOptions, WriteOptions
+    from export_model.exporter.play.options import PlayOptions
+    from export_model.exporter.verify.options import VerifyOptions
+    from export_model.signatures.errors import ExportModelError, ParityError
 
 _HOMES = {
-    **dict.fromkeys(("compare", "export", "inspect", "load", "play", "verify"), "exporter.interface"),
-    **dict.fromkeys(("ReadOptions", "WriteOptions"), "exporter.options"),
-    "PlayOptions": "exporter.play.options",
-    "VerifyOptions": "exporter.verify.options",
-    **dict.fromkeys(("ExportModelError", "ParityError"), "signatures.errors"),
+    **dict.fromkeys(("compare", "export", "inspect", "load", "play", "verify"), "export_model.exporter.interface"),
+    **dict.fromkeys(("ReadOptions", "WriteOptions"), "export_model.exporter.options"),
+    "PlayOptions": "export_model.exporter.play.options",
+    "VerifyOptions": "export_model.exporter.verify.options",
+    **dict.fromkeys(("ExportModelError", "ParityError"), "export_model.signatures.errors"),
     "__version__": "exporter",
 }
 
