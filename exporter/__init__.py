@@ -1,12 +1,15 @@
 """export-model: trained policies for every runtime, proven to act the same.
 
-``import export_model`` is what users import; ``from export_model.exporter import export_model, …`` has the same with flat keywords.
+``import export_model`` is what users import; ``from export_model.exporter import …`` has the same with flat keywords.
 Nothing heavy is imported before it is used: a cold start is a feature.
 """
 
 from __future__ import annotations
 
 import importlib
+
+if __name__ != "export_model.exporter":
+    raise ImportError("import it as export_model.exporter: only what holds export_model belongs on sys.path")
 
 #: pyproject.toml reads it from here.
 __version__ = "0.1.0"

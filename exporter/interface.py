@@ -32,7 +32,7 @@ from export_model.signatures.code import code_options
 from export_model.signatures.errors import ParityError, UsageError
 
 # What a program logs is found under the package's name, whichever module does the job.
-_LOG = logging.getLogger("export_model.exporter.api")
+_LOG = logging.getLogger("export_model")
 
 
 def export(

@@ -17,8 +17,11 @@ from typing import Any
 from export_model.exporter.cli.main import main
 
 ROOT = Path(__file__).resolve().parent.parent
-#: What Python finds the packages by, as an install in place does.
-PLACES = (ROOT, ROOT / "exporter/public")
+#: The package's own folder: its three modules, and links to the others' folders.
+PACKAGE = ROOT / ".ci/src/export_model"
+#: What Python finds the package by, as an install in place does; and these tests.
+PLACES = (PACKAGE.parent, ROOT)
+PYTHONPATH = os.pathsep.join(map(str, PLACES))
 
 
 @dataclass(frozen=True)
@@ -60,7 +63,7 @@ def python(*arguments: object, environment: Mapping[str, str] | None = None, cwd
     done = subprocess.run(
         [sys.executable, *(str(a) for a in arguments)],
         cwd=cwd,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, PLACES)), **(environment or {})},
+        env={**os.environ, "PYTHONPATH": PYTHONPATH, **(environment or {})},
         stdin=subprocess.DEVNULL,
         capture_output=True,
         encoding="utf-8",

@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-PACKAGES = ("signatures", "converters", "exporter")
+PACKAGES = ("signatures", "converters", "exporter", ".ci/src/export_model")
 _NOT_CODE = frozenset(
     (tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER)
 )
@@ -43,7 +43,7 @@ def code_lines(text: str) -> int:
 
 def room_of(path: str) -> str:
     """Return the room of a product file: its folder below the package, or the package for a file of its own."""
-    parts = Path(path).parts
+    parts = Path(path.removeprefix(".ci/src/")).parts
     return "/".join(parts[:2]) if len(parts) > 2 else parts[0]
 
 

@@ -13,13 +13,12 @@ from typing import Any, Final
 
 import pytest
 
-from export_model import converters, exporter, signatures
+import export_model
 
 #: Where one file after the other runs the same lines, coverage traces one in so many.
 TRACED: Final = {"corpus": 8, "legacy": 8, "slow": 4}
 #: Of a test with more than so many cases, one in four.
 MANY: Final = 64
-_PRODUCT = (signatures, converters, exporter)
 
 
 class Tracing:
@@ -60,10 +59,9 @@ class Tracing:
         controller = self._controller()
         if controller is None or not controller.started or self._plugins.hasplugin("dsession"):  # whose workers collect
             return (yield)
-        for package in _PRODUCT:
-            for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
-                if not module.name.endswith("__main__"):
-                    importlib.import_module(module.name)
+        for module in pkgutil.walk_packages(export_model.__path__, "export_model."):
+            if not module.name.endswith("__main__"):
+                importlib.import_module(module.name)
         controller.pause()
         try:
             return (yield)

@@ -1,4 +1,4 @@
-"""policy.schema.json, made of the records that a contract is read into: ``python -m export_model.exporter.reports.policy_schema``.
+"""policy.schema.json, of a contract's records: ``python -m export_model.exporter.reports.policy_schema``.
 
 msgspec says what may stand in a field, the record's docstring what it is, in a list (``- ``name``: text``) by the names
 that JSON has.

@@ -11,7 +11,7 @@ from typing import Any
 
 from msgspec import Struct
 
-import export_model.converters.formats.tfjs
+from export_model.converters.formats import tfjs
 from export_model.converters.formats.bundle.bundle import Bundle, dumps, writing
 from export_model.converters.formats.bundle.embed import runnable
 from export_model.converters.formats.bundle.exchange import exchange, stage
@@ -29,7 +29,7 @@ PAGE = Path(__file__).resolve().parent / "page"
 #: Stills of the environments, of ``make pictures``.
 PREVIEWS = PAGE.parent / "previews"
 _PREVIEW = "preview.png"
-POLICY_MODULE = Path(converters.formats.tfjs.__file__).resolve().parent / "js" / "policy.mjs"
+POLICY_MODULE = Path(tfjs.__file__).resolve().parent / "js" / "policy.mjs"
 #: All drawings; a page has that of its scene.
 _VIEWS = "views/index.mjs"
 #: The file by which a folder is known as ours.

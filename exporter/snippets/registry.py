@@ -66,7 +66,7 @@ def _render_at(render: Callable[[Bundle, javascript.Place], str], place: javascr
 
 
 TARGETS: tuple[Target, ...] = (
-    Target("load-policy", "Python, exporter.load_policy", "python", (ONNX, FROZEN_GRAPH), python.load_policy),
+    Target("load-policy", "Python, export_model", "python", (ONNX, FROZEN_GRAPH), python.load_policy),
     Target("onnxruntime", "Python, onnxruntime", "python", (ONNX,), python.onnxruntime),
     Target("saved-model", "Python, tf.saved_model.load", "python", (SAVED_MODEL,), python.saved_model),
     Target("serving-docker", "TensorFlow Serving, the container", "sh", (SAVED_MODEL,), serving.docker),

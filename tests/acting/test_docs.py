@@ -13,7 +13,7 @@ import pytest
 
 from export_model.converters.runtimes.javascript.node import js_home, node_executable
 from tests.acting.test_page_snippets import resolved
-from tests.commands import ROOT
+from tests.commands import PYTHONPATH, ROOT
 
 PAGE = ROOT / "docs" / "acting.md"
 
@@ -28,7 +28,7 @@ def test_its_blocks_run(tmp_path: Path) -> None:
     tool.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m export_model "$@"\n')
     tool.chmod(0o755)
     path = f"{tool.parent}{os.pathsep}{os.environ['PATH']}"
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PATH": path}
+    environment = {**os.environ, "PYTHONPATH": PYTHONPATH, "PATH": path}
     modules: list[str] = []
     for number, (kind, code) in enumerate(blocks):
         if kind == "js":

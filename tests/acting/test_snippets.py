@@ -26,7 +26,7 @@ from export_model.signatures.errors import ExportModelError
 from export_model.signatures.roles import Role
 from fixtures import path as fixture
 from tests.acting.snippet_bundles import NAMES, bundle_of, code_of
-from tests.commands import ROOT
+from tests.commands import PYTHONPATH, ROOT
 from tests.commands import export_model as run
 
 SHARED = ROOT.parent / "shared"
@@ -62,7 +62,7 @@ def answers(out: Path) -> Callable[[str, str], dict[str, Any]]:
             for target in ("onnxruntime", "saved-model", "serving-grpc", "load-policy"):
                 jobs[target, name] = {"kind": "python", "code": code_of(out, name, target)}
             jobs["serving-rest", name] = {"kind": "rest", "name": name, "body": rest_body(out, name)}
-        environment = {**os.environ, "PYTHONPATH": str(ROOT), "TF_CPP_MIN_LOG_LEVEL": "3", "CUDA_VISIBLE_DEVICES": ""}
+        environment = {**os.environ, "PYTHONPATH": PYTHONPATH, "TF_CPP_MIN_LOG_LEVEL": "3", "CUDA_VISIBLE_DEVICES": ""}
         command = [sys.executable, str(Path(__file__).with_name("run_snippets.py"))]
         done = subprocess.run(
             command, input=json.dumps(list(jobs.values())), capture_output=True, text=True, cwd=out, env=environment

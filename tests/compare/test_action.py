@@ -122,7 +122,7 @@ def test_nothing_of_the_checked_out_repository_is_run(job: Job, bundle: Path) ->
     names = ("pip", "json", "numpy", "onnxruntime", "click", "sitecustomize", "usercustomize", "struct", "runpy")
     for name in names:
         (job.folder / f"{name}.py").write_text(text)
-    for package in ("exporter", "converters", "signatures", "pip"):
+    for package in ("export_model", "exporter", "converters", "signatures", "pip"):
         (job.folder / package).mkdir()
         (job.folder / package / "__init__.py").write_text(text)
         (job.folder / package / "__main__.py").write_text(text)

@@ -93,7 +93,7 @@ def test_every_block_runs_in_order(installed: Path, tmp_path: Path) -> None:
         [
             str(installed),
             "-c",
-            "from export_model import exporter, export_model; print(exporter.__file__, export_model.__file__)",
+            "import export_model.exporter as inner, export_model; print(inner.__file__, export_model.__file__)",
         ],
         env=reader._environment(),
         cwd=folder,

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.commands import ROOT
+from tests.commands import PACKAGE, PLACES, ROOT
 from tests.docs.blocks import Block, blocks
 from tests.docs.workshop import NARROW
 
@@ -22,6 +22,7 @@ LEFT_OUT = shutil.ignore_patterns("node_modules", "__pycache__", "trained", "cor
 def copied(folder: Path) -> None:
     for part in PARTS:
         shutil.copytree(ROOT / part, folder / part, ignore=LEFT_OUT)
+    shutil.copytree(PACKAGE, folder / PACKAGE.relative_to(ROOT), symlinks=True)
     shutil.copy(ROOT / "pyproject.toml", folder)
     modules = "converters/runtimes/javascript/js/node_modules"
     if (ROOT / modules).is_dir():
@@ -41,7 +42,8 @@ def insert(block: Block, folder: Path) -> None:
 
 def run(command: list[str], block: Block, folder: Path) -> None:
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    modules = f"{folder / NARROW.relative_to(ROOT)}{os.pathsep}{folder}"
+    places = (NARROW, *PLACES)
+    modules = os.pathsep.join(str(folder / place.relative_to(ROOT)) for place in places)
     environment = {**os.environ, "PATH": path, "PYTHONPATH": modules, "PYTHONSAFEPATH": "1"}
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, encoding="utf-8", check=False)
     assert done.returncode == 0, f"{block.where}:\n{done.stdout[-4000:]}\n{done.stderr[-2000:]}"

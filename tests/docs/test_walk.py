@@ -11,7 +11,7 @@ import pytest
 
 from export_model.exporter.export.options import ExportOptions
 from export_model.exporter.export.pipeline import export
-from tests.commands import ROOT
+from tests.commands import PACKAGE, ROOT
 
 PAGE = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
 #: The paragraph: the files in their order, the rooms that they ask, the folders whose own files declare.
@@ -36,8 +36,8 @@ def files_run(source: Path, out: Path) -> list[str]:
 
     def note(frame: FrameType, event: str, argument: object) -> None:
         path = frame.f_code.co_filename
-        if event == "call" and path.startswith(f"{ROOT}/"):
-            found[path.removeprefix(f"{ROOT}/")] = None
+        if event == "call" and path.startswith(f"{PACKAGE}/"):
+            found[path.removeprefix(f"{PACKAGE}/")] = None
 
     def run(folder: str) -> None:
         list(export([source], ExportOptions(out=out / folder, targets=["tfjs"], verify="none"), lambda _: None))

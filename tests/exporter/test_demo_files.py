@@ -85,7 +85,7 @@ for form in environments.FORMS:
         steps.append([seen.tolist(), info["action_mask"].tolist() if "action_mask" in info else []])
         over = terminated or truncated
     told[form] = [actions, steps, rewards, terminated, info["is_success"]]
-assert not [name for name in sys.modules if name.split(".")[0] == "exporter"]
+assert not [name for name in sys.modules if name.split(".")[0] == "export_model"]
 print(json.dumps(told))
 """
 

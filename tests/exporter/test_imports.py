@@ -14,30 +14,39 @@ from pathlib import Path
 from export_model import exporter
 from export_model.converters.formats.registry import ROOMS
 from export_model.exporter.cli.app import app
-from tests.commands import ROOT, python
+from tests.commands import PACKAGE, ROOT, python
 
 #: package → the packages of this project that it may import
 ALLOWED = {
     "signatures": {"signatures"},
     "converters": {"signatures", "converters"},
     "exporter": {"signatures", "converters", "exporter"},
+    "export_model": {"signatures", "exporter"},
 }
+#: In the package's own folder the others are links, which are not followed.
 MODULES = [
-    path for package in ALLOWED for path in sorted((ROOT / package).rglob("*.py")) if "node_modules" not in str(path)
+    path
+    for place in (ROOT / "signatures", ROOT / "converters", ROOT / "exporter", PACKAGE)
+    for path in sorted(place.rglob("*.py"))
+    if "node_modules" not in str(path)
 ]
 HEAVY = {"tensorflow", "onnxruntime", "tensorflowjs", "tf2onnx", "torch", "keras"}
 RUNTIMES = {"tensorflow", "onnxruntime"}
 
 
 def imported(tree: ast.AST) -> Iterator[str]:
-    """Top-level names of all imports in a piece of code."""
+    """Top-level names of all imports in a piece of code; of ours, the name below ``export_model``."""
     for found in ast.walk(tree):
         if isinstance(found, ast.Import):
-            yield from (alias.name.split(".")[0] for alias in found.names)
+            yield from (top_of(alias.name) for alias in found.names)
         elif isinstance(found, ast.ImportFrom):
             assert found.level == 0, "relative imports hide what is imported"
             assert found.module is not None
-            yield found.module.split(".")[0]
+            yield from (top_of(f"{found.module}.{alias.name}") for alias in found.names)
+
+
+def top_of(module: str) -> str:
+    return module.removeprefix("export_model.").split(".")[0]
 
 
 def at_module_level(tree: ast.Module) -> Iterator[str]:
@@ -51,7 +60,13 @@ def at_module_level(tree: ast.Module) -> Iterator[str]:
 
 
 def name_of(path: Path) -> str:
-    return path.relative_to(ROOT).as_posix()
+    return path.relative_to(PACKAGE.parent if path.is_relative_to(PACKAGE) else ROOT).as_posix()
+
+
+def module_of(path: Path) -> str:
+    """The one name that a module is imported by."""
+    name = name_of(path).removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+    return name if path.is_relative_to(PACKAGE) else f"export_model.{name}"
 
 
 def test_the_modules_are_found() -> None:
@@ -72,7 +87,7 @@ def importing(modules: Iterable[Path], wrong: Callable[[Path], set[str]]) -> dic
 def test_imports_go_one_way() -> None:
     def wrong(module: Path) -> set[str]:
         own = set(imported(tree_of(module))) & set(ALLOWED)
-        return own - ALLOWED[module.relative_to(ROOT).parts[0]]
+        return own - ALLOWED[name_of(module).split("/")[0]]
 
     assert importing(MODULES, wrong) == {}
 
@@ -119,7 +134,7 @@ def own_imports(path: Path, names: set[str]) -> set[str]:
 
 def test_no_module_imports_itself_round_a_corner() -> None:
     """Lazy imports count: a cycle that is only broken by waiting is a cycle."""
-    paths = {name_of(p).removesuffix(".py").removesuffix("/__init__").replace("/", "."): p for p in MODULES}
+    paths = {module_of(p): p for p in MODULES}
     left = {name: own_imports(path, set(paths)) - {name} for name, path in paths.items()}
     while free := {name for name, others in left.items() if not others}:
         left = {name: others - free for name, others in left.items() if name not in free}
@@ -142,18 +157,18 @@ ROOMS_FROM_BELOW = (
 
 def room_of(module: str) -> str | None:
     """The room of ``converters`` that a module lies in; None elsewhere."""
-    package, _, rest = module.partition(".")
-    return rest.partition(".")[0] if package == "converters" and rest else None
+    _, package, room, *_ = *module.split("."), "", ""
+    return room if package == "converters" and room else None
 
 
 def test_rooms_import_only_those_below_them() -> None:
     """Every import counts, those inside of functions too: an arrow upward is a cycle waiting for its other half."""
-    names = {name_of(p).removesuffix(".py").removesuffix("/__init__").replace("/", ".") for p in MODULES}
+    names = {module_of(p) for p in MODULES}
     level = {room: number for number, room in enumerate(ROOMS_FROM_BELOW)}
     upward = [
         f"{module} -> {other}"
         for path in MODULES
-        for module in [name_of(path).removesuffix(".py").removesuffix("/__init__").replace("/", ".")]
+        for module in [module_of(path)]
         for other in sorted(own_imports(path, names))
         if (own := room_of(module)) and (asked := room_of(other)) and level[own] < level[asked]
     ]
@@ -164,7 +179,7 @@ def test_readers_name_no_trainer() -> None:
     """A trainer is a room and a line of the registry: no reader asks one by its name."""
     from export_model.converters.trainers.registry import ROOMS
 
-    names = {name_of(p).removesuffix(".py").removesuffix("/__init__").replace("/", ".") for p in MODULES}
+    names = {module_of(p) for p in MODULES}
     theirs = {n for n in names for room in ROOMS if f"{n}.".startswith(f"export_model.converters.trainers.{room}.")}
     outside = [p for p in MODULES if not p.is_relative_to(ROOT / "converters/trainers")]
     assert importing(outside, lambda m: own_imports(m, names) & theirs) == {}
@@ -182,14 +197,10 @@ def test_nothing_below_the_command_line_asks_it() -> None:
 
 
 def loaded_by(*arguments: object) -> set[str]:
-    """Top-level modules that a command imports."""
+    """Top-level modules that a command imports; of ours, the name below ``export_model``."""
     ran = python("-X", "importtime", *arguments)
     assert ran.status == 0, ran.err
-    return {
-        line.rpartition("|")[2].strip().split(".")[0]
-        for line in ran.err.splitlines()
-        if line.startswith("import time:")
-    }
+    return {top_of(line.rpartition("|")[2].strip()) for line in ran.err.splitlines() if line.startswith("import time:")}
 
 
 def test_help_starts_without_anything_heavy() -> None:
@@ -289,7 +300,8 @@ def test_a_verified_bundle_is_vetted_without_what_costs_most(tmp_path: Path) -> 
 
 
 def test_the_package_loads_its_functions_when_they_are_asked_for() -> None:
-    code = "import sys, exporter; print('numpy' in sys.modules); exporter.export_model; print('numpy' in sys.modules)"
+    code = "import sys, export_model.exporter as e; print('numpy' in sys.modules); e.export_model; "
+    code += "print('numpy' in sys.modules)"
     assert python("-c", code).out.split() == ["False", "True"]
     assert "has no attribute 'nothing'" in python("-c", "from export_model import exporter; exporter.nothing").err
 
@@ -322,7 +334,7 @@ def test_every_name_that_is_resolved_later_is_there() -> None:
 
 def asked_later(room: Path) -> Iterator[tuple[str, str]]:
     """(module, function) of all that a room's ``__init__`` asks of what ``defer_imports`` gives."""
-    tree, package = tree_of(room), ".".join(room.parent.relative_to(ROOT).parts)
+    tree, package = tree_of(room), module_of(room)
     modules: dict[str, str] = {}
     for found in ast.walk(tree):
         if isinstance(found, ast.Assign) and ast.unparse(found.value).startswith("defer_imports("):

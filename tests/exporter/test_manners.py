@@ -137,7 +137,7 @@ sys.meta_path.insert(0, Interrupt())
     "start",
     [
         "from export_model.exporter.cli.main import main",
-        "import runpy; runpy.run_module('exporter', run_name='__main__')",
+        "import runpy; runpy.run_module('export_model', run_name='__main__')",
     ],
 )
 def test_an_interrupt_before_the_program_has_begun_is_no_traceback(start: str) -> None:

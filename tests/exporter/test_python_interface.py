@@ -292,7 +292,7 @@ def test_a_notebook_shows_tables_of_escaped_text(tmp_path: Path) -> None:
 def test_steps_are_logged_and_nothing_is_printed(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    caplog.set_level("INFO", logger="exporter")
+    caplog.set_level("INFO", logger="export_model")
     export_model(BALL, tmp_path, verify="none", to="onnx")
     said = [r.getMessage() for r in caplog.records]
     assert said[0] == f"reading {BALL}"

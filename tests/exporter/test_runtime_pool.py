@@ -19,7 +19,7 @@ from export_model.converters.runtimes.pool import RuntimePool, chosen_runtimes, 
 from export_model.converters.runtimes.registry import RUNTIMES, RuntimeInfo
 from export_model.signatures.errors import RuntimeUnavailableError, UsageError
 from fixtures import path as fixture
-from tests.commands import ROOT
+from tests.commands import PLACES
 
 NODE = {r.name: r for r in javascript.RUNTIMES}
 NAMES = ("numpy", "tensorflow", "tf1.4", "onnxruntime", "tfjs-cpu", "tfjs-wasm")
@@ -203,7 +203,7 @@ serve("waits", "7", lambda header: 1 / 0, (), out)
 
 
 def waits(file: Path) -> Callable[[], list[str]]:
-    return lambda: [sys.executable, "-c", WAITS, str(file), str(ROOT)]
+    return lambda: [sys.executable, "-c", WAITS, str(file), str(PLACES[0])]
 
 
 def test_processes_start_side_by_side(tmp_path: Path) -> None:

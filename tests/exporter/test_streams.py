@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from fixtures import path as fixture
-from tests.commands import ROOT
+from tests.commands import PYTHONPATH, ROOT
 
 PROGRAM = f"{sys.executable} -P -m export_model"
 
@@ -19,7 +19,7 @@ def shell(line: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         ["bash", "-c", line],
         cwd=ROOT,
-        env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin", "HOME": str(Path.home())},
+        env={"PYTHONPATH": PYTHONPATH, "PATH": "/usr/bin:/bin", "HOME": str(Path.home())},
         capture_output=True,
         text=True,
         check=False,

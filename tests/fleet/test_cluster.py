@@ -23,7 +23,7 @@ from export_model.exporter.fleet.fleet import export_fleet
 from export_model.exporter.fleet.worker import Outcome, Wanted
 from export_model.signatures.errors import RuntimeUnavailableError
 from fixtures import path as fixture
-from tests.commands import ROOT, export_model
+from tests.commands import PYTHONPATH, export_model
 from tests.fleet.test_fleet import contents, lines
 
 distributed = pytest.importorskip("distributed")
@@ -51,7 +51,7 @@ def sources(tmp_path: Path) -> list[Path]:
 def cluster(tmp_path: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
     """The scheduler's address, and its workers."""
     place = tmp_path / "scheduler.json"
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "DASK_DISTRIBUTED__WORKER__DAEMON": "false"}
+    environment = {**os.environ, "PYTHONPATH": PYTHONPATH, "DASK_DISTRIBUTED__WORKER__DAEMON": "false"}
     log = (tmp_path / "dask.log").open("wb")
 
     def start(*arguments: str) -> subprocess.Popen[bytes]:

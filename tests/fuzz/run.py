@@ -13,6 +13,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from tests.commands import PYTHONPATH
+
 #: Seconds that a mutant may take on the clock of a busy machine; what it computes is limited to far less.
 HANG = 300.0
 GOOD = ("ok", "refused")
@@ -51,7 +53,7 @@ class _Worker:
     """One process; it is given ranges of numbers, and ended where it does not answer."""
 
     def __init__(self, readers: Sequence[str]) -> None:
-        environment = {**os.environ, "PYTHONPATH": str(_ROOT), "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+        environment = os.environ | {"PYTHONPATH": PYTHONPATH, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
         self._process = subprocess.Popen(
             [sys.executable, "-m", "tests.fuzz.worker", *readers],
             cwd=_ROOT, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,

@@ -23,7 +23,7 @@ from pathlib import Path
 
 from export_model.converters.formats.bundle.bundle import Bundle
 from fixtures import path as fixture
-from tests.commands import ROOT, default_signals
+from tests.commands import PYTHONPATH, ROOT, default_signals
 
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 #: Runtimes → one in so many runs.
@@ -107,7 +107,7 @@ class Kills:
             "--verify",
             runtimes,
         ]
-        env = {**os.environ, "PYTHONPATH": str(ROOT), "TMPDIR": str(temporary), _MARK: mark}
+        env = {**os.environ, "PYTHONPATH": PYTHONPATH, "TMPDIR": str(temporary), _MARK: mark}
         return subprocess.Popen(
             command,
             cwd=ROOT,

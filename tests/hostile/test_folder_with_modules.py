@@ -8,13 +8,14 @@ import sys
 from pathlib import Path
 
 from fixtures import path as fixture
-from tests.commands import ROOT
+from tests.commands import PLACES
 from tests.exporter.test_imports import MODULES, name_of, tree_of
 
 #: Modules that Python, multiprocessing and the children import early.
-NAMES = ("multiprocessing", "pickle", "runpy", "json", "struct", "numpy", "onnxruntime", "converters")
+NAMES = ("multiprocessing", "pickle", "runpy", "json", "struct", "numpy", "onnxruntime", "export_model")
 #: What the console script does: the script's folder goes before all others, not the one that the user stands in.
-SCRIPT = f"import sys; sys.path[0] = {str(ROOT)!r}; from export_model.exporter.cli.main import main\nif __name__ == '__main__': main()"
+SCRIPT = f"import sys; sys.path[0] = {str(PLACES[0])!r}; from export_model.exporter.cli.main import main\n"
+SCRIPT += "if __name__ == '__main__': main()"
 
 
 def test_modules_beside_models_are_not_imported(tmp_path: Path) -> None:

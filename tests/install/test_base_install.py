@@ -9,7 +9,7 @@ import shutil
 import subprocess
 import sys
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,19 +19,19 @@ from export_model.converters.formats.registry import DEFAULTS
 from export_model.exporter import __version__
 from export_model.exporter.export.pipeline import ExportOptions, export
 from fixtures import path
+from tests.commands import PACKAGE, ROOT
+from tests.install.conftest import succeeded
 
 # One group: the environment is made once, whatever the number of test processes.
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("install")]
 
-ROOT = Path(__file__).resolve().parents[2]
-PACKAGES = ("exporter", "converters", "signatures")
-#: The folder of the package that users import, which stands beside the others where it is installed.
-PUBLIC = "exporter/public/"
+#: The checkout's folders of what is installed below ``export_model``, and the package's own modules.
+PLACES = ("exporter", "converters", "signatures", PACKAGE.relative_to(ROOT))
 #: Suffixes of what is in the packages beside modules: pages, scripts, schemas, templates of snippets.
 DATA = {".css", ".html", ".json", ".mjs", ".mts", ".svg", ".tmpl", ".typed"}
 #: The trained policies that come along, for ``export-model demo``.
 DEMO = {
-    f"exporter/demo/{name}"
+    f"export_model/exporter/demo/{name}"
     for name in (
         *("3DBall.bytes", "Hallway.bytes", "GridWorld.bytes", "Tennis.bytes", "3DBall.pt"),
         *("sb3_discrete.onnx", "torch_actor.onnx", "torch_actor.onnx.data"),
@@ -78,21 +78,6 @@ class Installed:
         return self.run("export-model", str(path("continuous")), "-o", "out", *arguments)
 
 
-def succeeded(command: Sequence[str]) -> str:
-    done = subprocess.run(command, capture_output=True, encoding="utf-8", errors="replace")
-    assert done.returncode == 0, f"{' '.join(command)}\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}"
-    return done.stdout
-
-
-@pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The wheel, built as pip builds it: with the build backend in an environment of its own."""
-    folder = tmp_path_factory.mktemp("wheel")
-    succeeded([sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", str(folder), str(ROOT)])
-    (built,) = folder.glob("*.whl")
-    return built
-
-
 @pytest.fixture(scope="module")
 def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Installed]:
     home, scratch = tmp_path_factory.mktemp("base") / "venv", tmp_path_factory.mktemp("scratch")
@@ -110,16 +95,13 @@ def test_the_wheel_has_the_packages_with_their_data_and_nothing_else(wheel: Path
     with zipfile.ZipFile(wheel) as archive:
         names = archive.namelist()
         metadata = archive.read(next(n for n in names if n.endswith(".dist-info/METADATA"))).decode()
-    assert {n.split("/")[0] for n in names} == {
-        *PACKAGES,
-        "export_model",
-        f"export_model-{__version__}.dist-info",
-    }
-    data = {in_wheel(p) for t in PACKAGES for p in files(t, "*") if p.suffix in DATA}
-    js, templates = "converters/runtimes/javascript/js", "exporter/snippets/templates"
+    assert {n.split("/")[0] for n in names} == {"export_model", f"export_model-{__version__}.dist-info"}
+    data = {in_wheel(p) for t in PLACES for p in files(t, "*") if p.suffix in DATA}
+    ours, theirs = "export_model/exporter", "export_model/converters"
+    js, templates = f"{theirs}/runtimes/javascript/js", f"{ours}/snippets/templates"
     assert data >= {f"{js}/package.json", f"{js}/package-lock.json", f"{js}/runner.mjs", f"{js}/browser.mjs"}
-    assert data >= {"exporter/serve/page/index.html", "exporter/reports/parity.schema.json"}
-    assert data >= {f"{templates}/agent.cs.tmpl", "converters/formats/tfjs/js/policy.mjs"}
+    assert data >= {f"{ours}/serve/page/index.html", f"{ours}/reports/parity.schema.json"}
+    assert data >= {f"{templates}/agent.cs.tmpl", f"{theirs}/formats/tfjs/js/policy.mjs"}
     assert {n for n in names if Path(n).suffix in DATA} == data
     strays = [
         n
@@ -129,7 +111,7 @@ def test_the_wheel_has_the_packages_with_their_data_and_nothing_else(wheel: Path
     assert not strays
     with zipfile.ZipFile(wheel) as archive:
         assert sum(archive.getinfo(name).compress_size for name in DEMO) <= 80_000
-    code = {in_wheel(p) for t in PACKAGES for p in files(t, "*.py")}
+    code = {in_wheel(p) for t in PLACES for p in files(t, "*.py")}
     assert {n for n in names if n.endswith(".py")} == code
     required = [line for line in metadata.splitlines() if line.startswith("Requires-Dist:") and "extra ==" not in line]
     names_required = sorted(re.split(r"[<>=!~;]", line.split()[1])[0] for line in required)
@@ -144,12 +126,12 @@ def test_the_wheel_has_the_packages_with_their_data_and_nothing_else(wheel: Path
 
 
 def in_wheel(file: Path) -> str:
-    """The name of a file of the checkout in the wheel."""
-    return file.relative_to(ROOT).as_posix().removeprefix(PUBLIC)
+    """Where a file of the checkout lies in the wheel."""
+    return f"export_model/{file.relative_to(PACKAGE if file.is_relative_to(PACKAGE) else ROOT).as_posix()}"
 
 
-def files(package: str, pattern: str) -> Iterator[Path]:
-    return (p for p in (ROOT / package).rglob(pattern) if "node_modules" not in p.parts)
+def files(place: Path | str, pattern: str) -> Iterator[Path]:
+    return (p for p in (ROOT / place).rglob(pattern) if "node_modules" not in p.parts)
 
 
 # ------------------------------------------------------------------ the environment

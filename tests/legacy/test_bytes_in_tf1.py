@@ -1,6 +1,6 @@
 """Every ``.bytes`` that is written loads and runs in the runtimes of TensorFlow 1.4 and 1.7, and agrees.
 
-Agreement is judged by export_model.exporter.verify, as in ``--verify tf1.4``: its inputs, tolerances, steps with the memory fed back
+Agreement is judged by exporter/verify, as in ``--verify tf1.4``: its inputs, tolerances, steps with the memory fed back
 and draws. The reference is numpy.
 """
 

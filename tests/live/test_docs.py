@@ -16,7 +16,7 @@ import pytest
 
 from export_model.exporter.export.sources import read_source
 from fixtures import path as fixture
-from tests.commands import ROOT, python
+from tests.commands import PYTHONPATH, ROOT, python
 
 PAGE = (ROOT / "docs/live.md").read_text(encoding="utf-8")
 #: Heading → the program under it.
@@ -63,7 +63,7 @@ def export_policies(monkeypatch: pytest.MonkeyPatch) -> tuple[Callable[..., list
     exec(PROGRAMS[OLD], names)
     assert names["EXPORT_MODEL"] == ["export-model"]
     names["EXPORT_MODEL"] = [sys.executable, "-m", "export_model"]
-    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    monkeypatch.setenv("PYTHONPATH", PYTHONPATH)
     return names["export_policies"], names
 
 

@@ -91,7 +91,7 @@ def _place() -> Path:
     version = f"{sys.version_info.major}.{sys.version_info.minor}"
     missing = " ".join([_PACKAGES, *_missing()])
     digest = hashlib.sha256(REQUIREMENTS.read_bytes() + SHIM.read_bytes() + (version + missing).encode()).hexdigest()
-    # Imported here: export_model.converters.runtimes.registry is small, but the benchmark's own process should stay smaller still.
+    # Imported here: converters/runtimes/registry.py is small, but the benchmark's process should stay smaller still.
     from export_model.converters.runtimes.installed import cache_folder
 
     return cache_folder() / f"peers-{digest[:12]}"

@@ -23,12 +23,14 @@ from export_model.converters.runtimes.pool import RuntimePool
 from export_model.exporter.export.pipeline import ExportOptions, export
 from export_model.signatures.errors import RuntimeUnavailableError
 from tests.bench.big_policies import OBSERVED, frozen
+from tests.commands import PLACES
 
 pytestmark = pytest.mark.skipif(not all(in_force().values()), reason="this kernel lacks Landlock or seccomp")
 
 #: Asked of what is neither terminal nor file: EPERM is the filter's answer, ENOTTY the kernel's.
 ASKED = """
 import fcntl, os
+from tests.commands import PLACES
 try:
     fcntl.ioctl(os.pipe()[0], {:#x}, bytes(32))
 except OSError as error:
@@ -147,7 +149,8 @@ def test_it_can(code: str, way: str, tmp_path: Path) -> None:
 
 def test_a_part_that_is_refused_ends_the_process(tmp_path: Path) -> None:
     """The kernel takes 16 rulesets of Landlock from a process: one more is not left out in silence."""
-    code = "from export_model.converters.files.children import confinement as c\nfor _ in range(17): c._landlock(None, ['/'])"
+    code = "from export_model.converters.files.children import confinement as c\n"
+    code += "for _ in range(17): c._landlock(None, ['/'])"
     done = tried(code, tmp_path)
     assert done.returncode != 0 and b"this process cannot be confined" in done.stderr
 
@@ -189,7 +192,7 @@ serve("hungry", "1", lambda header: Model(), (MemoryError,), claim_stdout())
 
 
 def hungry() -> list[str]:
-    return [sys.executable, "-c", f"import sys; sys.path.insert(0, {str(Path.cwd())!r})\n{HUNGRY}"]
+    return [sys.executable, "-c", f"import sys; sys.path.insert(0, {str(PLACES[0])!r})\n{HUNGRY}"]
 
 
 def test_memory_is_bounded_by_what_it_is_given(tmp_path: Path) -> None:
@@ -252,7 +255,7 @@ def test_its_folder_is_gone_when_it_is() -> None:
     code = "from export_model.converters.files.children.child import *; import os; out = claim_stdout(); "
     code += "serve('a', os.environ['TMPDIR'], None, (), out)"
     with RuntimeProcess(
-        "a", [sys.executable, "-c", f"import sys; sys.path.insert(0, {str(Path.cwd())!r}); {code}"]
+        "a", [sys.executable, "-c", f"import sys; sys.path.insert(0, {str(PLACES[0])!r}); {code}"]
     ) as process:
         folder = Path(process.start())
         assert folder.is_dir()

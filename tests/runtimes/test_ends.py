@@ -13,14 +13,14 @@ import pytest
 
 from export_model.converters.files.children.process import RunFailedError, RuntimeProcess
 from export_model.signatures.errors import RuntimeUnavailableError
-from tests.commands import ROOT, default_signals
+from tests.commands import PLACES, default_signals
 from tests.runtimes.graph_models import info, node, placeholder, write_model
 from tests.runtimes.pipe import NEEDS_NODE
 
 #: A Python child that never ends a request.
 BUSY = f"""
 import os, sys
-sys.path.insert(0, {str(ROOT)!r})
+sys.path.insert(0, {str(PLACES[0])!r})
 from export_model.converters.files.children.child import claim_stdout, serve
 out = claim_stdout()
 def load(header):
@@ -32,7 +32,7 @@ serve("busy", "1", load, (), out)
 #: A parent that waits for a child of it.
 PARENT = f"""
 import sys
-sys.path.insert(0, {str(ROOT)!r})
+sys.path.insert(0, {str(PLACES[0])!r})
 from export_model.converters.files.children.process import RuntimeProcess
 RuntimeProcess("busy", [sys.executable, "-c", {BUSY!r}], confined=False).load(sys.argv[1])
 """
@@ -40,7 +40,7 @@ RuntimeProcess("busy", [sys.executable, "-c", {BUSY!r}], confined=False).load(sy
 MULTIPLYING = f"""
 import sys, threading
 import numpy as np
-sys.path.insert(0, {str(ROOT)!r})
+sys.path.insert(0, {str(PLACES[0])!r})
 from export_model.converters.files.children.process import RuntimeProcess
 from export_model.converters.runtimes.registry import RUNTIMES
 def multiply():
@@ -135,7 +135,7 @@ def test_one_that_speaks_no_frames_is_refused(said: bytes) -> None:
 
 INTERRUPTED = f"""
 import pathlib, sys
-sys.path.insert(0, {str(ROOT)!r})
+sys.path.insert(0, {str(PLACES[0])!r})
 from export_model.converters.runtimes.pool import RuntimePool
 never = "import time; time.sleep(600)"
 with RuntimePool({{"a": lambda: [sys.executable, "-c", never]}}) as pool:

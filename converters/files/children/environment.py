@@ -15,8 +15,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from functools import cache
 from pathlib import Path
 
-from export_model import converters
 from export_model.converters.files.children.confinement import READABLE
+from export_model.converters.files.children.python import PACKAGE
 
 #: Variables that a child is given where they are set, and what reads them.
 _KEPT = frozenset((
@@ -76,7 +76,9 @@ def readable_places(command: Sequence[str]) -> tuple[str, ...]:
 def _places_of_python(path: tuple[str, ...]) -> tuple[str, ...]:
     prefixes = [place for prefix in (sys.prefix, sys.base_prefix) for place in _of_prefix(Path(prefix))]
     found = [*prefixes, *os.environ.get("LD_LIBRARY_PATH", "").split(os.pathsep)]
-    found += [str(Path(converters.__file__).resolve().parent.with_name(name)) for name in ("converters", "signatures")]
+    found += [f"{PACKAGE.parent}/", f"{PACKAGE}/", str(PACKAGE / "__init__.py")]
+    # In a checkout these two are links, and the kernel asks where they lead.
+    found += [str((PACKAGE / name).resolve()) for name in ("converters", "signatures")]
     for entry in map(Path, path):
         found += [] if any(entry.is_relative_to(prefix) for prefix in prefixes) else _of_modules(entry)
     return _apart_from_home(found)

@@ -11,12 +11,12 @@ import threading
 from collections.abc import Sequence
 from pathlib import Path
 
-from export_model import converters
-
-#: Modules come from this very copy of the packages, installed or not, and none (-P) from the folder that the user
+#: The package that this module is in. Links are not followed: in a checkout the folders below it are links.
+PACKAGE = Path(__file__).absolute().parents[3]
+#: Modules come from this very copy of the package, installed or not, and none (-P) from the folder that the user
 #: stands in, where ``-c`` looks first: it may be untrusted.
 _PYTHON = (sys.executable, "-P", "-c")
-_PATH = f"import sys; sys.path.insert(0, {str(Path(converters.__file__).resolve().parent.parent)!r}); "
+_PATH = f"import sys; sys.path.insert(0, {str(PACKAGE.parent)!r}); "
 
 
 def child_command(module: str, *arguments: str) -> list[str]:
@@ -35,7 +35,8 @@ def confined_command(command: Sequence[str], scratch: str) -> list[str]:
     parent = os.getpid() if threading.current_thread() is threading.main_thread() else 0
     if tuple(command[:3]) == _PYTHON and command[3].startswith(_PATH):
         # A child of ours gives up by itself, before it does anything else: a program for it costs another 30 ms.
-        first = f"from export_model.converters.files.children import confinement; confinement.begin({scratch!r}, {parent}); "
+        first = "from export_model.converters.files.children import confinement; "
+        first += f"confinement.begin({scratch!r}, {parent}); "
         return [*_PYTHON, _PATH + first + command[3].removeprefix(_PATH), *command[4:]]
     if shutil.which(command[0]) is None:
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), command[0])

@@ -76,7 +76,7 @@ class Shared:
 
 
 class Subgraph:
-    """One function of a model (implements export_model.converters.graph.ops.litert.base.LitertBuilder)."""
+    """One function of a model (implements ``LitertBuilder`` of converters/graph/ops/litert/base.py)."""
 
     def __init__(self, graph: Graph, outputs: Iterable[str], shared: Shared, options: WriteOptions) -> None:
         self.graph, self.shared, self.storage, self.batch = graph, shared, options.weights, options.batch

@@ -29,7 +29,7 @@ _GRAPH, _VALUES = "graph.pb", "graph.pb.npz"
 
 
 class SessionValues:
-    """The values of variables by their nodes' names, as ``export_model.converters.formats.checkpoint.freeze`` takes them."""
+    """The values of variables by their nodes' names, as ``converters/formats/checkpoint/freeze.py`` takes them."""
 
     place = "live session"
 

@@ -48,7 +48,7 @@ PRODUCER = "export-model"
 
 
 class _Builder:
-    """The nodes and initializers of a model in the making (implements export_model.converters.graph.ops.base.OnnxBuilder)."""
+    """Nodes and initializers of a model in the making (implements ``OnnxBuilder`` of converters/graph/ops/base.py)."""
 
     def __init__(self, graph: Graph, opset: int, outputs: Collection[str]) -> None:
         self.opset = opset

@@ -1,4 +1,4 @@
-"""LiteRT in its own process: ``python -m export_model.converters.runtimes.litert.child``; told ``plain``, without XNNPACK.
+"""LiteRT in its own process: ``python -m export_model.converters.runtimes.litert.child``; ``plain``: without XNNPACK.
 
 A model is called by ``signature``, or by its tensors' own names where it has none, for as many agents as are fed.
 """
