@@ -17,7 +17,7 @@ from export_model.exporter.cli.app import app
 from export_model.exporter.demo import BALL
 from export_model.exporter.snippets.registry import TARGETS
 from export_model.exporter.verify import cut, rounding, statistics
-from export_model.exporter.verify.checks import decisions, densities, mixed
+from export_model.exporter.verify.checks import decisions, densities, draws, mixed
 from export_model.exporter.verify.difference import SHARE, SIZE
 from export_model.exporter.verify.options import VerifyOptions
 from export_model.exporter.verify.tolerances import ATOL, RTOL, Tolerance, tolerance_for
@@ -97,6 +97,8 @@ def test_the_figures_of_agreement_are_those_of_the_program() -> None:
         "never less than 2⁻¹⁷",
         "a thousandth of its variation",
         "`action_probs` (5e-3)",
+        draws.CLASSES_SEEN,
+        draws.NUMBERS_SEEN,
     ):
         assert claim in text, claim
     assert (SHARE, SIZE) == (1e-3, 2.0**-17)

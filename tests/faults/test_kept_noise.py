@@ -14,6 +14,7 @@ from export_model.converters.compiler.options import CompileOptions
 from export_model.converters.runtimes.pool import RuntimePool
 from export_model.exporter.export.again import verify_folder
 from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.verify.checks.draws import NUMBERS_SEEN
 from export_model.exporter.verify.options import VerifyOptions
 from export_model.exporter.verify.participants import Feeds
 from export_model.exporter.verify.report import ParityReport
@@ -139,3 +140,13 @@ def test_a_runtime_that_shares_draws_as_the_reference_does_agrees() -> None:
     assert _shared_otherwise(each, mixed) is not None
     saturated = np.where(rng.random((512, 1)) < 0.01, 0.9, 1.0)
     assert _shared_otherwise(saturated, np.ones((512, 1))) is None
+
+
+def test_what_a_test_of_draws_would_miss_is_said_with_the_verdict(tmp_path: Path, processes: RuntimePool) -> None:
+    """A .nn has no place where our kernels can be cut: it is held to a distribution, by how many draws is said."""
+    options = ExportOptions(tmp_path / "out", ("nn",), compile=CompileOptions(noise="keep"), verify=("tensorflow",))
+    (result,) = export([noisy(tmp_path)], options, pool=processes)
+    assert result.report is not None and not [f for f in result.report.failures if f.judges]
+    assert {f.kind for f in result.report.comparisons if f.format == "nn"} >= {"draws"}
+    (note,) = (n for n in result.report.notes if n.startswith("nn in numpy"))
+    assert note.endswith(f"its samplers are not those of the policy: {NUMBERS_SEEN}")
