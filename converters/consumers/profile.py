@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NoReturn
 
 from msgspec import Struct
@@ -19,7 +19,8 @@ class Profile(Struct, frozen=True, eq=False, kw_only=True):
 
     ``formats`` are those that it loads, the usual one first. ``dress`` gives the policy under the names, dtypes and
     layouts that the consumer looks up, or raises ProfileError. ``importers`` are those of
-    ``converters/consumers/unity/readings.py`` that must read every construct of the ONNX rightly, ``checkers`` the
+    ``converters/consumers/unity/readings.py`` that must read every construct of the ONNX rightly, ``misread`` gives
+    the operators that one of them lacks or misreads in some form, ``checkers`` the
     releases of ``converters/consumers/unity/consumers.py`` whose checks must accept it, ``players`` those whose player
     must play it. ``opset`` is the ONNX opset.
     ``code`` is the snippet that says how to use its files. ``loaders`` are those of
@@ -35,6 +36,7 @@ class Profile(Struct, frozen=True, eq=False, kw_only=True):
     dress: Callable[[Policy], Policy]
     opset: int = 15
     importers: tuple[str, ...] = ()
+    misread: Callable[[Sequence[str]], frozenset[str]] | None = None
     checkers: tuple[str, ...] = ()
     players: tuple[str, ...] = ()
     code: str = "agent"
@@ -49,11 +51,7 @@ class Profile(Struct, frozen=True, eq=False, kw_only=True):
 
     def write_options(self, contract: str) -> WriteOptions:
         """Return how a writer makes the files of this consumer."""
-        misread = frozenset[str]()
-        if self.importers:
-            from export_model.converters.consumers.unity.readings import misread_ops
-
-            misread = misread_ops(self.importers)
+        misread = frozenset[str]() if self.misread is None else self.misread(self.importers)
         return WriteOptions(contract, self.opset, self.name, misread=misread, batch=self.batch)
 
 

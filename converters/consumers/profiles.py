@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 
 from export_model.converters.consumers.mlagents import version2, version3
@@ -40,6 +41,15 @@ TFSHARP = tuple(
     for g, purpose in _GENERATIONS
 )
 _UNITY6 = releases_for("unity6")
+
+
+def _misread_ops(importers: Sequence[str]) -> frozenset[str]:
+    """``misread_ops`` of the readings, whose tables an export without such a profile has no use for."""
+    from export_model.converters.consumers.unity.readings import misread_ops
+
+    return misread_ops(importers)
+
+
 #: The newest first; ``--for help`` shows them in this order.
 PROFILES: tuple[Profile, ...] = (
     Profile(
@@ -50,6 +60,7 @@ PROFILES: tuple[Profile, ...] = (
         # PreviousActionInputGenerator of 3.0.0 throws at the first decision (../shared/unity/r3/player.json)
         dress=partial(version3.dress, profile="unity6", feeds_previous=False),
         importers=tuple(c.runtime for c in _UNITY6),
+        misread=_misread_ops,
         checkers=tuple(c.name for c in _UNITY6),
         players=tuple(c.name for c in _UNITY6),
     ),
@@ -62,6 +73,7 @@ PROFILES: tuple[Profile, ...] = (
         dress=partial(version3.dress, profile="barracuda-3", transposes_buffers=True),
         opset=12,
         importers=("Barracuda 3.0.0",),
+        misread=_misread_ops,
         checkers=("R20",),
         players=("R20",),
     ),
@@ -72,6 +84,7 @@ PROFILES: tuple[Profile, ...] = (
         dress=partial(version3.dress, profile="barracuda-1.4", transposes_buffers=True),
         opset=12,
         importers=("Barracuda 1.4.0", "Barracuda 2.0.0", "Barracuda 2.3.1"),
+        misread=_misread_ops,
         checkers=("R20",),
         players=("2.0.1",),
     ),
@@ -83,6 +96,7 @@ PROFILES: tuple[Profile, ...] = (
         dress=partial(version2.dress, profile="barracuda-1.0"),
         opset=11,
         importers=("Barracuda 1.1.2", "Barracuda 1.4.0"),
+        misread=_misread_ops,
         checkers=("R20",),
         players=("1.9.1", "1.0.8"),
     ),

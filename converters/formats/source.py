@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from export_model.converters.files import tensorflow_messages as schema
 from export_model.converters.files.external_data import Detached
 from export_model.converters.files.folders import scratch_folder
-from export_model.converters.formats.frozen_graph.subgraph import check, subgraph
+from export_model.converters.formats.subgraph import check, subgraph
 from export_model.converters.graph.nodes import Graph
 from export_model.converters.policy.facts import SourceFacts
 from export_model.signatures.errors import ExportModelError

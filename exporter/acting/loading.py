@@ -152,10 +152,11 @@ def _fault(what: str, error: Exception) -> BundleError:
 
 def _in_numpy(model: bytes) -> tuple[Run, Declared]:
     from export_model.converters.formats.bundle.bundle import declared_by
-    from export_model.converters.formats.bundle.embed import read_runnable
+    from export_model.converters.formats.embed import runnable
+    from export_model.converters.formats.frozen_graph.reader import read_graph
     from export_model.converters.graph.run import run_graph
 
-    graph = read_runnable(model)
+    graph = runnable(read_graph(model))
     return lambda feeds, fetch: run_graph(graph, feeds, fetch), declared_by(graph)
 
 

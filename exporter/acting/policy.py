@@ -75,7 +75,7 @@ class LoadedPolicy:
 
     def _repr_html_(self) -> str:
         from export_model.exporter.inspect.inspection import port_tables
-        from export_model.exporter.reports.markup import notebook
+        from export_model.exporter.markup import notebook
 
         return notebook(f"{self.name}: a policy in {self.runtime}", *port_tables(self.signature))
 

@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from export_model.converters.policy.policy import Policy
     from export_model.exporter.export.options import ExportOptions
     from export_model.exporter.export.pipeline import ExportResult
+    from export_model.exporter.markup import Markup
     from export_model.exporter.play.report import PlayReport
     from export_model.exporter.reports.entry import Entry
-    from export_model.exporter.reports.markup import Markup
     from export_model.exporter.verify.options import VerifyOptions
     from export_model.signatures.code import CodeOptions
     from export_model.signatures.errors import ExportModelError

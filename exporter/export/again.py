@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from export_model.converters.files.folders import scratch_folder
 from export_model.converters.formats.bundle.bundle import Bundle, unfit
-from export_model.converters.formats.bundle.embed import runnable
+from export_model.converters.formats.embed import runnable
 from export_model.converters.formats.format import Format
 from export_model.converters.formats.programs.artifact import can_confine
 from export_model.converters.formats.registry import FROZEN_GRAPH, KERNELS, WRITTEN, own_reference

@@ -14,7 +14,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from export_model.converters.compiler.passes.weights import Storage, round_weights
-from export_model.converters.formats.bundle.embed import FIXED_BATCH
+from export_model.converters.formats.embed import FIXED_BATCH
 from export_model.converters.formats.format import Artifact, Format, WriteOptions
 from export_model.converters.formats.registry import ONNX, WRITTEN
 from export_model.converters.formats.source import ReadOptions, SourceModel

@@ -86,7 +86,7 @@ class ExportResult(Struct, frozen=True):
         return f"<ExportResult {self.policy.name!r} {verdict}: {', '.join(self.sizes)} in {path_text(self.folder)!r}>"
 
     def _repr_html_(self) -> str:
-        from export_model.exporter.reports.markup import notebook
+        from export_model.exporter.markup import notebook
 
         return notebook(repr(self)) if self.report is None else notebook(repr(self)) + self.report._repr_html_()
 

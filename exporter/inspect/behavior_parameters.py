@@ -11,7 +11,7 @@ from pathlib import Path
 from export_model.converters.consumers.unity.checker import UnityVerdict
 from export_model.converters.consumers.unity.findings import Thrown
 from export_model.converters.consumers.unity.players import Outcome
-from export_model.exporter.reports.markup import Markup, el, svg_file
+from export_model.exporter.markup import Markup, el, svg_file
 
 _WIDTH, _LINE, _MARGIN, _VALUE = 560, 22, 16, 250
 _LETTERS = 78

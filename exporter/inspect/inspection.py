@@ -116,7 +116,7 @@ class Inspection(Struct, frozen=True):
         return f"<Inspection of {str(self.path)!r}: {self.kind}, {names}{more}>"
 
     def _repr_html_(self) -> str:
-        from export_model.exporter.reports.markup import notebook
+        from export_model.exporter.markup import notebook
 
         tables = [t for p in self.policies for t in port_tables(p.policy.signature)]
         return notebook(f"{self.path}: {self.kind}, {size_text(self.size)}", *tables)

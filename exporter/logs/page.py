@@ -10,7 +10,7 @@ from export_model.exporter import __version__
 from export_model.exporter.logs.check import LogReport
 from export_model.exporter.logs.recording import Array
 from export_model.exporter.logs.wording import report_lines, sentence
-from export_model.exporter.reports.markup import Markup, el, svg
+from export_model.exporter.markup import Markup, el, svg
 from export_model.exporter.reports.page import document
 from export_model.exporter.reports.sections import section, table
 

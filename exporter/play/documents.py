@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from export_model.exporter import __version__
+from export_model.exporter.markup import Markup, el
 from export_model.exporter.play import pictures
 from export_model.exporter.play.report import PlayReport, figure, signed_text
 from export_model.exporter.reports import sections
 from export_model.exporter.reports.entry import Entry
 from export_model.exporter.reports.junit import junit_file, play_suite, suites_of
 from export_model.exporter.reports.markdown import PLAY_MARKS, code, text
-from export_model.exporter.reports.markup import Markup, el
 from export_model.exporter.reports.page import document
 from export_model.exporter.reports.write import Documents
 from export_model.exporter.verify.plays import CONFIDENCE, DIFFERENT, EQUIVALENT, NOT_DECIDED

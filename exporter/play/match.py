@@ -10,7 +10,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from export_model.converters.files.children.process import RunFailedError
-from export_model.converters.formats.bundle.embed import runnable
+from export_model.converters.formats.embed import runnable
 from export_model.converters.graph.run import run_graph
 from export_model.converters.policy.policy import Policy
 from export_model.exporter.acting.policy import LoadedPolicy

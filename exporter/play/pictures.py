@@ -7,10 +7,10 @@ from collections.abc import Callable
 
 import numpy as np
 
+from export_model.exporter.markup import Markup, el, svg
 from export_model.exporter.play.equivalence import PERCENTILES
 from export_model.exporter.play.report import PlayReport, figure, signed_text
 from export_model.exporter.reports.charts import colour_of
-from export_model.exporter.reports.markup import Markup, el, svg
 from export_model.exporter.verify.plays import DIFFERENT
 
 _LEFT, _RIGHT, _ROW = 8.0, 314.0, 34.0

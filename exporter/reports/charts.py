@@ -9,9 +9,9 @@ import itertools
 import math
 from collections.abc import Sequence
 
+from export_model.exporter.markup import Markup, el, svg
 from export_model.exporter.reports.layers import Block
 from export_model.exporter.reports.layout import layout
-from export_model.exporter.reports.markup import Markup, el, svg
 from export_model.exporter.verify.difference import BINS, FIRST, LAST
 from export_model.exporter.verify.findings import Finding
 

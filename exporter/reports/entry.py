@@ -12,7 +12,7 @@ from export_model.converters.files.fetch import path_text
 from export_model.converters.formats.bundle.bundle import Bundle
 from export_model.converters.graph.nodes import Graph
 from export_model.exporter.export.pipeline import ExportResult
-from export_model.exporter.reports.markup import Markup
+from export_model.exporter.markup import Markup
 from export_model.exporter.verify.report import ParityReport
 from export_model.signatures.contract import Contract
 from export_model.signatures.errors import ExportModelError

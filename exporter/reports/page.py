@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from export_model.exporter import __version__
+from export_model.exporter.markup import Markup, el
 from export_model.exporter.reports import sections
 from export_model.exporter.reports.entry import Entry
-from export_model.exporter.reports.markup import Markup, el
 from export_model.exporter.reports.refused import place_of
 from export_model.exporter.verify.report import Pair
 from export_model.signatures.errors import ExportModelError

@@ -9,9 +9,9 @@ from typing import Any
 from msgspec.structs import replace
 
 from export_model.converters.policy.policy import Policy
+from export_model.exporter.markup import Markup, el, svg_file
 from export_model.exporter.reports.charts import diagram_parts
 from export_model.exporter.reports.layers import Block, blocks_of
-from export_model.exporter.reports.markup import Markup, el, svg_file
 from export_model.signatures.errors import UsageError
 from export_model.signatures.spec import TensorSpec
 

@@ -8,10 +8,10 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from export_model.converters.interfaces.text import loop_lines, tables
+from export_model.exporter.markup import Child, Markup, el
 from export_model.exporter.reports import charts
 from export_model.exporter.reports.entry import Entry
 from export_model.exporter.reports.layers import blocks_of
-from export_model.exporter.reports.markup import Child, Markup, el
 from export_model.exporter.tables import command_text, count_text, size_with_original
 from export_model.exporter.verify.findings import Failure, Finding, Rollout
 from export_model.exporter.verify.plays import CONFIDENCE

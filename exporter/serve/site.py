@@ -13,8 +13,8 @@ from msgspec import Struct
 
 from export_model.converters.formats import tfjs
 from export_model.converters.formats.bundle.bundle import Bundle, dumps, writing
-from export_model.converters.formats.bundle.embed import runnable
 from export_model.converters.formats.bundle.exchange import exchange, stage
+from export_model.converters.formats.embed import runnable
 from export_model.converters.formats.registry import FROZEN_GRAPH, ONNX, TFJS, WRITTEN
 from export_model.converters.runtimes.javascript.node import INSTALL_TFJS, check_packages, js_home, package_version
 from export_model.exporter import __version__

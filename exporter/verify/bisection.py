@@ -16,7 +16,7 @@ import numpy as np
 from msgspec import Struct
 
 from export_model.converters.files.children.process import RunFailedError
-from export_model.converters.formats.bundle.embed import runnable
+from export_model.converters.formats.embed import runnable
 from export_model.converters.formats.frozen_graph.reader import read_graph
 from export_model.converters.formats.intermediate_tensors import InnerTensors
 from export_model.converters.formats.registry import WRITTEN

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
-from export_model.converters.formats.bundle.embed import runnable
+from export_model.converters.formats.embed import runnable
 from export_model.converters.graph.nodes import Graph, Node
 from export_model.converters.graph.ops.table import traits
 from export_model.converters.graph.run import run_graph

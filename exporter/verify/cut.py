@@ -20,7 +20,7 @@ from export_model.converters.compiler.passes.noise import tensor_of
 from export_model.converters.files import tensorflow_messages as schema
 from export_model.converters.files.children.process import LoadedModel
 from export_model.converters.files.external_data import Detached
-from export_model.converters.formats.bundle.embed import runnable
+from export_model.converters.formats.embed import runnable
 from export_model.converters.formats.frozen_graph.encode import encode
 from export_model.converters.formats.intermediate_tensors import InnerTensors, RunAll, Sampler
 from export_model.converters.graph.editor import Editor

@@ -93,7 +93,7 @@ class ParityReport(Struct, frozen=True):
         return f"<ParityReport {self.policy!r} {self.verdict}: {compared}{self._worst}>"
 
     def _repr_html_(self) -> str:
-        from export_model.exporter.reports.markup import notebook
+        from export_model.exporter.markup import notebook
 
         rows = [(p.format, p.runtime, f"{'✓' if p.passed else '✗'} {p.word}", p.worst_text) for p in self.pairs]
         return notebook(f"{self.policy}: {self.sentence}", (("format", "runtime", "verdict", "of tolerance"), rows))

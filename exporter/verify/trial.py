@@ -12,7 +12,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from export_model.converters.files.folders import scratch_folder
-from export_model.converters.formats.bundle.embed import runnable
+from export_model.converters.formats.embed import runnable
 from export_model.converters.formats.registry import narrows
 from export_model.converters.graph.nodes import Graph
 from export_model.converters.graph.run import run_graph

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from export_model.converters.formats.bundle.embed import runnable
+from export_model.converters.formats.embed import runnable
 from export_model.converters.graph.nodes import Graph, ref
 from export_model.converters.graph.ops.table import traits
 from export_model.converters.graph.shapes import infer_types

@@ -13,7 +13,7 @@ from msgspec.structs import replace
 
 from export_model.converters.compiler.options import CompileOptions
 from export_model.converters.files.children.process import RunFailedError
-from export_model.converters.formats.bundle.embed import runnable
+from export_model.converters.formats.embed import runnable
 from export_model.converters.formats.frozen_graph.reader import read_graph
 from export_model.converters.formats.intermediate_tensors import InnerTensors, View
 from export_model.converters.formats.onnx.tensor_map import TensorMap, loads

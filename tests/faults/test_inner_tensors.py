@@ -7,7 +7,7 @@ import pytest
 from msgspec.structs import replace
 
 from export_model.converters.compiler.targets import FEWER_OPS, prepare
-from export_model.converters.formats.bundle.embed import runnable
+from export_model.converters.formats.embed import runnable
 from export_model.converters.formats.saved_model.artifact import graph
 from export_model.converters.graph.nodes import node_of
 from export_model.converters.graph.run import run_graph

@@ -1,4 +1,4 @@
-"""What the op table says of ops, held against the kernels; and that no other file lists ops."""
+"""What the op table says of ops, held against the kernels; and that no file lists ops but theirs and some readers'."""
 
 from __future__ import annotations
 

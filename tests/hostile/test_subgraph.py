@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from export_model.converters.formats.frozen_graph.subgraph import subgraph
+from export_model.converters.formats.subgraph import subgraph
 from export_model.converters.graph.ops.table import FORBIDDEN
 from export_model.signatures.errors import ExportModelError, UnsupportedOpError
 from tests.handmade import constant, continuous_policy, graph_def, node
@@ -85,6 +85,6 @@ def test_a_tensor_that_is_not_there_is_an_error() -> None:
 
 
 def test_no_op_that_reaches_outside_computes() -> None:
-    from export_model.converters.formats.frozen_graph.subgraph import COMPUTING
+    from export_model.converters.formats.subgraph import COMPUTING
 
     assert not COMPUTING & FORBIDDEN

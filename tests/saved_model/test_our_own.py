@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from export_model.converters.compiler.passes.weights import Storage
 from export_model.converters.files import tensorflow_messages as schema
-from export_model.converters.formats.bundle.embed import runnable
+from export_model.converters.formats.embed import runnable
 from export_model.converters.formats.format import WriteOptions
 from export_model.converters.formats.frozen_graph.reader import read_graph
 from export_model.converters.formats.registry import WRITTEN

@@ -15,8 +15,8 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from export_model.converters.files.fetch import inside, neighbours, path_text
-from export_model.converters.formats.bundle.embed import contract_text, without_contract
 from export_model.converters.formats.bundle.exchange import exchange, recover, stage, take_away
+from export_model.converters.formats.embed import contract_text, without_contract
 from export_model.converters.formats.format import Artifact, Format
 from export_model.converters.formats.frozen_graph.reader import read_graph
 from export_model.converters.graph.nodes import Graph

@@ -18,8 +18,8 @@ from export_model.converters.files.fetch import read_bytes
 from export_model.converters.files.memory_mapped import Mapped
 from export_model.converters.formats.format import Port, Ports
 from export_model.converters.formats.frozen_graph.reader import from_graph_def, read_graph
-from export_model.converters.formats.frozen_graph.subgraph import subgraph
 from export_model.converters.formats.intermediate_tensors import Feeds, InnerTensors, Loaded, own_names, samplers_of
+from export_model.converters.formats.subgraph import subgraph
 from export_model.converters.graph.nodes import Graph, node_of
 from export_model.converters.graph.ops.table import is_fed
 

@@ -152,8 +152,3 @@ def _set_shape(proto: Any, value: TensorShape) -> None:
         return
     for size in value.dims:
         proto.dim.add(size=-1 if size is None else size)
-
-
-def string_constant(name: str, text: str) -> Node:
-    """An unconnected string Const: how a GraphDef carries the contract."""
-    return Node(name, "Const", value=np.array(text.encode(), np.bytes_))

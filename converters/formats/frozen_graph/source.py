@@ -5,7 +5,7 @@ from __future__ import annotations
 from export_model.converters.files import tensorflow_messages as schema
 from export_model.converters.files.external_data import Detached
 from export_model.converters.files.fetch import Fetched
-from export_model.converters.formats.bundle.embed import facts_of, split_contract
+from export_model.converters.formats.embed import facts_of, split_contract
 from export_model.converters.formats.frozen_graph.reader import from_graph_def
 from export_model.converters.formats.source import OriginalRun, ReadOptions, SourceModel
 

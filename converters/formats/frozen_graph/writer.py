@@ -8,7 +8,7 @@ from export_model.converters.compiler.passes.weights import Storage, store_compa
 from export_model.converters.files import tensorflow_messages as schema
 from export_model.converters.files.chunks import Pieces
 from export_model.converters.files.external_data import Detached, is_readable
-from export_model.converters.formats.bundle.embed import with_contract
+from export_model.converters.formats.embed import with_contract
 from export_model.converters.formats.format import WriteOptions
 from export_model.converters.formats.frozen_graph.encode import encode
 from export_model.converters.graph.nodes import Graph

@@ -12,7 +12,7 @@ import numpy as np
 from msgspec import Struct
 
 from export_model.converters.compiler.options import MAX_PORTS
-from export_model.converters.formats.bundle.embed import contract_of
+from export_model.converters.formats.embed import contract_of
 from export_model.converters.formats.litert.artifact import note, operator_of
 from export_model.converters.formats.litert.flatbuffer import Table, decode
 from export_model.converters.formats.litert.importer.importer import Importer

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from export_model.converters.files.fetch import Fetched
-from export_model.converters.formats.bundle.embed import facts_of, redrawn
+from export_model.converters.formats.embed import facts_of, redrawn
 from export_model.converters.formats.litert.reader import LitertModel, read_litert
 from export_model.converters.formats.saved_model.signature import expose_signature
 from export_model.converters.formats.source import OriginalRun, ReadOptions, SourceModel

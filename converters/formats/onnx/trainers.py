@@ -12,8 +12,8 @@ from collections.abc import Mapping
 import numpy as np
 from msgspec.structs import replace
 
-from export_model.converters.formats.bundle.embed import contract_of, redrawn
-from export_model.converters.formats.bundle.embed import facts_of as facts_of_contract
+from export_model.converters.formats.embed import contract_of, redrawn
+from export_model.converters.formats.embed import facts_of as facts_of_contract
 from export_model.converters.formats.onnx.output_roles import output_roles, positional
 from export_model.converters.formats.onnx.reader import OnnxModel
 from export_model.converters.formats.onnx.tensor_map import TENSORS_KEY

@@ -15,11 +15,11 @@ from msgspec.structs import replace
 from export_model.converters.files.fetch import read_bytes
 from export_model.converters.formats.format import Ports
 from export_model.converters.formats.frozen_graph.reader import from_graph_def
-from export_model.converters.formats.frozen_graph.subgraph import subgraph
 from export_model.converters.formats.intermediate_tensors import Feeds, InnerTensors, Loaded, own_names, samplers_of
 from export_model.converters.formats.saved_model.reader import read_saved_model
 from export_model.converters.formats.saved_model.source import FILE, frozen_model, values_beside
 from export_model.converters.formats.source import OriginalRun
+from export_model.converters.formats.subgraph import subgraph
 from export_model.converters.graph.nodes import Graph, normal_ref
 from export_model.signatures.errors import NotAPolicyError
 

@@ -13,7 +13,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 from export_model.converters.files import tensorflow_messages as schema
-from export_model.converters.formats.frozen_graph.subgraph import COMPUTING, is_pivot
+from export_model.converters.formats.subgraph import COMPUTING, is_pivot
 from export_model.converters.graph.nodes import NameScope, Node, normal_ref, reachable, ref, renamed_ref, split_ref
 from export_model.converters.graph.ops.table import (
     CALLING,

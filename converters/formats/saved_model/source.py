@@ -11,11 +11,11 @@ from msgspec.structs import replace
 from export_model.converters.compiler.passes.unjoined_products import rejoin_biases
 from export_model.converters.files.fetch import Fetched, read_bytes
 from export_model.converters.files.file_probe import Content
-from export_model.converters.formats.bundle.embed import contract_text, facts_of, split_contract
 from export_model.converters.formats.checkpoint.freeze import freeze, with_values
 from export_model.converters.formats.checkpoint.tensor_bundle import Checkpoint
 from export_model.converters.formats.checkpoint.training_graph import Saved as Place
 from export_model.converters.formats.checkpoint.training_graph import TrainingGraph, saved_places, training_graph
+from export_model.converters.formats.embed import contract_text, facts_of, split_contract
 from export_model.converters.formats.frozen_graph.reader import from_graph_def
 from export_model.converters.formats.frozen_graph.source import read as read_frozen
 from export_model.converters.formats.saved_model.inlining import flat

@@ -15,12 +15,12 @@ from msgspec.structs import replace
 from export_model.converters.files import tensorflow_messages as schema
 from export_model.converters.files.external_data import Detached
 from export_model.converters.files.fetch import read_bytes
-from export_model.converters.formats.frozen_graph.subgraph import subgraph
 from export_model.converters.formats.saved_model.reader import read_saved_model
 from export_model.converters.formats.saved_model.signature import Tensor
 from export_model.converters.formats.saved_model.source import FILE, frozen_model, values_beside
 from export_model.converters.formats.saved_model.variables import files_of
 from export_model.converters.formats.saved_model.writer import METHOD
+from export_model.converters.formats.subgraph import subgraph
 
 
 def safe_copy(path: Path, wanted: Sequence[str], folder: Path) -> Path:

@@ -19,8 +19,8 @@ from export_model.converters.files.fetch import MAX_BYTES, read_bytes
 from export_model.converters.files.file_probe import json_in
 from export_model.converters.files.folders import scratch_folder
 from export_model.converters.formats.format import Port, Ports
-from export_model.converters.formats.frozen_graph.subgraph import COMPUTING
 from export_model.converters.formats.intermediate_tensors import InnerTensors, Loaded, RunAll, own_names, samplers_of
+from export_model.converters.formats.subgraph import COMPUTING
 from export_model.converters.formats.tfjs.reader import MODEL, read_signature, shard
 from export_model.converters.graph.nodes import Node
 from export_model.converters.graph.ops.table import CALLING, ORDERING, unsupported_error

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from export_model.converters.compiler.passes.int8_products import join_products
 from export_model.converters.files.fetch import Fetched
-from export_model.converters.formats.bundle.embed import contract_of, facts_of, redrawn
+from export_model.converters.formats.embed import contract_of, facts_of, redrawn
 from export_model.converters.formats.saved_model.signature import expose_signature
 from export_model.converters.formats.source import ReadOptions, SourceModel
 from export_model.converters.formats.tfjs.reader import content_of, model_file, read_model, weights_of

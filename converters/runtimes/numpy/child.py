@@ -17,7 +17,7 @@ import numpy as np
 from export_model.converters.consumers.named_files import kernels
 from export_model.converters.files.children.child import claim_stdout, serve
 from export_model.converters.files.children.frames import Tensors
-from export_model.converters.formats.bundle.embed import runnable
+from export_model.converters.formats.embed import runnable
 from export_model.converters.formats.format import Format
 from export_model.converters.formats.registry import FROZEN_GRAPH, WRITTEN
 from export_model.converters.graph.jitter import Jitter

@@ -15,8 +15,6 @@ from msgspec.structs import replace
 
 from export_model.converters.compiler.passes.normalise import normalise
 from export_model.converters.compiler.passes.signature import derived_notes
-from export_model.converters.formats.frozen_graph.encode import string_constant
-from export_model.converters.formats.frozen_graph.reader import read_graph
 from export_model.converters.graph.nodes import Graph, NameScope, Node, topological
 from export_model.converters.graph.ops.table import traits
 from export_model.converters.policy.facts import SourceFacts
@@ -32,8 +30,8 @@ FIXED_BATCH = "made for batches of "
 
 
 def with_contract(graph: Graph, contract: str) -> Graph:
-    """The graph with the contract as an unconnected string constant."""
-    return Graph((*graph.nodes, string_constant(EMBEDDED, contract)))
+    """The graph with the contract as an unconnected string constant: how a GraphDef carries it."""
+    return Graph((*graph.nodes, Node(EMBEDDED, "Const", value=np.array(contract.encode(), np.bytes_))))
 
 
 def without_contract(graph: Graph) -> Graph:
@@ -59,11 +57,6 @@ def runnable(graph: Graph) -> Graph:
         graph.cache[runnable] = normalise(graph if len(told) == len(graph.nodes) else Graph(tuple(told)))
     made: Graph = graph.cache[runnable]
     return made
-
-
-def read_runnable(data: bytes) -> Graph:
-    """The graph of a ``.bytes`` as the numpy kernels run it. Raises SourceError and its like, GraphError."""
-    return runnable(read_graph(data))
 
 
 # ------------------------------------------------------------------ reading an artefact back
