@@ -40,7 +40,12 @@ SOURCES = (
     *("torch_checkpoint/ppo_0_21_discrete_lstm.pt", "torch_checkpoint/ppo_1_1_hybrid_lstm.pt"),
     *("torch_checkpoint/sac_0_28_hybrid_lstm.pt", "torch_checkpoint/poca_0_26_discrete.pt"),
     *("torchscript/isaac_gru_script.pt", "torchscript/legged_lstm_script.pt", "torchscript/bent_script.pt"),
-    *("torchscript/convolved_trace.pt", "torchscript/painted_trace.pt", "torchscript/attending_trace.pt"),
+    *(
+        "torchscript/convolved_trace.pt",
+        "torchscript/painted_trace.pt",
+        "torchscript/shrunk_trace.pt",
+        "torchscript/attending_trace.pt",
+    ),
 )
 
 

@@ -6,6 +6,7 @@ import math
 
 from export_model.converters.graph.builder import Builder
 from export_model.converters.graph.nn.activations import clip, scale_and_shift
+from export_model.converters.graph.ops.approximations import RANGES
 
 
 def sinh(b: Builder, x: str) -> str:
@@ -37,6 +38,7 @@ def acosh(b: Builder, x: str) -> str:
 
 def atanh(b: Builder, x: str) -> str:
     """½·ln((1 + x) / (1 − x))."""
+    x = _end_at_one(b, x)
     one = b.number(x, 1, "one")
     return scale_and_shift(b, b.add("Log", [b.add("RealDiv", [b.add("Add", [one, x]), b.add("Sub", [one, x])])]), 0.5)
 
@@ -66,6 +68,7 @@ def atan(b: Builder, x: str) -> str:
 
 def asin(b: Builder, x: str) -> str:
     """atan(x / √((1 − x)·(1 + x))); ±1 gives ±π/2 through the division by 0, beyond them NaN as it should."""
+    x = _end_at_one(b, x)
     one = b.number(x, 1, "one")
     root = b.add("Sqrt", [b.add("Mul", [b.add("Sub", [one, x]), b.add("Add", [one, x])])])
     return atan(b, b.add("RealDiv", [x, root]))
@@ -74,6 +77,12 @@ def asin(b: Builder, x: str) -> str:
 def acos(b: Builder, x: str) -> str:
     """π/2 − asin(x)."""
     return b.add("Sub", [b.number(x, math.pi / 2, "right_angle"), asin(b, x)])
+
+
+def _end_at_one(b: Builder, x: str) -> str:
+    """``x``, cut to ±1 where a function gives it that ends there: a runtime's goes some units beyond it (RANGES)."""
+    _, high = RANGES.get(b.producer(x).op, (-math.inf, math.inf))
+    return clip(b, x, -1, 1) if high < math.inf else x
 
 
 def _one_plus_square(b: Builder, x: str) -> str:
