@@ -9,9 +9,13 @@ from pathlib import Path
 import numpy as np
 import onnx
 import pytest
+from msgspec.structs import replace
 from onnx import numpy_helper
 
+from export_model.converters.formats.barracuda.format import parse
+from export_model.converters.formats.barracuda.writer import encode
 from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.export.pipeline import ExportOptions, export
 from export_model.exporter.verify.report import ParityReport
 from tests.comparing import compare_artefacts
 
@@ -104,3 +108,13 @@ def test_what_no_runtime_loads_is_said_to_have_run_as_what_was_written_of_it(tmp
     report = compared(TORCH / "ppo_1_1.pt", Path(own), pool)
     assert report.self_consistent
     assert "torch_checkpoint was run as export-model's ONNX model of it" in report.notes
+
+
+def test_a_barracuda_file_of_another_maker_agrees_with_itself(tmp_path: Path, pool: RuntimePool) -> None:
+    """It embeds no contract."""
+    (result,) = export([ROOT / "continuous.bytes"], ExportOptions(tmp_path, targets=("nn",), verify="none"))
+    model = parse((result.folder / "continuous.nn").read_bytes())
+    other = tmp_path / "theirs.nn"
+    other.write_bytes(encode(replace(model, trailer=None)))
+    report = compared(other, other, pool)
+    assert report.passed is True, report.failures

@@ -44,9 +44,9 @@ def write(policy: Policy, options: WriteOptions) -> Mapping[str, Pieces]:
     return {f"{policy.name}.nn": Pieces(encode(replace(policy_model(policy), trailer=trailer)))}
 
 
-def embedded_contract(path: Path) -> str:
-    """The contract that a ``.nn`` carries, empty where it has none. Raises OSError, DamagedFileError."""
-    return parse(path.read_bytes()).metadata(EMBEDDED) or ""
+def embedded_contract(path: Path) -> str | None:
+    """The contract that a ``.nn`` carries, None where it has none. Raises OSError, DamagedFileError."""
+    return parse(path.read_bytes()).metadata(EMBEDDED)
 
 
 def contract_of(model: NnModel) -> PolicySignature:
