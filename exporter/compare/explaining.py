@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
+from msgspec.structs import replace
 
 from export_model.exporter.logs.judging import LOG_TOLERANCE, targets_of
 from export_model.exporter.logs.recording import NONE, Array, Recording
@@ -48,6 +49,18 @@ _CHANGES = {
     "action_offset": "moved",
     "lag": "a step apart",
 }
+
+
+#: Words of an agent's log → what they are where the side ``log`` is held against the ``other``.
+_WORDS = (
+    ("was given", "would be given"),
+    ("× what was logged", "× what the {log} is"),
+    ("than what was logged", "than the {log}'s"),
+    ("what was logged", "the {log}'s action"),
+    (" before it was logged", " by the {log}"),
+    ("the log", "the {log}"),
+    ("the policy", "the {other}"),
+)
 
 
 class Explaining:
@@ -90,17 +103,24 @@ def _explanations(trial: Trial, participant: Participant, heads: Mapping[str, st
     }
     for side, other in (("candidate", "reference"), ("reference", "candidate")):
         answered = [s.name for s in signature.outputs] if other == "reference" else participant.outputs
-        found = _explain(signature, runs[other], answered, logs[side])
+        found = _explain(signature, runs[other], answered, logs[side], heads)
         if found is not None and found.whole:
-            yield f"{label}: the {side} is the {other} with {', '.join(_phrases(found))}"
+            yield f"{label}: the {side} is the {other} with {', '.join(_phrases(found, side, other))}"
             return
 
 
-def _phrases(found: Explanation) -> Iterator[str]:
+def _phrases(found: Explanation, side: str, other: str) -> Iterator[str]:
     for cause in found.causes:
         others = [c.where for c in found.others if c.kind == cause.kind][:2]
         also = f", or {', '.join(others)}" if others else ""
-        yield f"{cause.where} {_CHANGES[cause.kind]} ({cause.says}{also})"
+        yield f"{cause.where} {_CHANGES[cause.kind]} ({in_sides(cause.says, side, other)}{also})"
+
+
+def in_sides(sentence: str, log: str, other: str) -> str:
+    """Return what a cause says of an agent's log and its policy as said of two sides."""
+    for word, of_side in _WORDS:
+        sentence = sentence.replace(word, of_side.format(log=log, other=other))
+    return sentence
 
 
 def _play(
@@ -141,12 +161,15 @@ def _recording(
     )
 
 
-def _explain(signature: PolicySignature, run: Run, answered: Sequence[str], recording: Recording) -> Explanation | None:
+def _explain(
+    signature: PolicySignature, run: Run, answered: Sequence[str], recording: Recording, heads: Mapping[str, str]
+) -> Explanation | None:
     """What makes the steps those of the policy that ``run`` runs; None where they are, or nothing does.
 
-    ``answered`` are the outputs that it can be asked for.
+    ``answered`` are the outputs that it can be asked for; ``heads``: head → the output that was recorded of it.
     """
     targets = targets_of(signature, recording, draws_itself=False)
+    targets = [t if t.branches else replace(t, answer=heads.get(t.name, t.answer)) for t in targets]
     pair = signature.recurrence
     names = dict.fromkeys([*(n for t in targets for n in t.output_names), *(pair[1:] if pair else ())])
     if not set(names) <= set(answered):

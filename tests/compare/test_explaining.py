@@ -2,70 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 import onnx
 import pytest
-from onnx import helper, numpy_helper
 
 from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.compare.explaining import in_sides
 from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.logs import causes
 from fixtures import path as fixture
+from tests.compare.planted import ACTOR, PAIRS, Edit, before_input, compared, is_named, other_weights
 from tests.comparing import compare_artefacts
 
-ROOT = Path(__file__).resolve().parents[2] / "fixtures"
-CONTINUOUS = ROOT / "sb3/torch_actor_legacy.onnx"
-MEMORY = ROOT / "torch_checkpoint/ppo_1_1_hybrid_lstm.onnx"
-Edit = Callable[[onnx.ModelProto], None]
-
-
-def constant(model: onnx.ModelProto, value: np.ndarray) -> str:
-    name = f"planted_{len(model.graph.initializer)}"
-    model.graph.initializer.append(numpy_helper.from_array(value, name))
-    return name
-
-
-def before_input(op: str, *operands: np.ndarray, place: int = 0, **attributes: int) -> Edit:
-    """An op between an input and the graph."""
-
-    def edit(model: onnx.ModelProto) -> None:
-        graph = model.graph
-        name = graph.input[place].name
-        for node in graph.node:
-            node.input[:] = ["planted" if i == name else i for i in node.input]
-        given = [constant(model, value) for value in operands]
-        graph.node.insert(0, helper.make_node(op, [name, *given], ["planted"], **attributes))
-
-    return edit
-
-
-def after_output(op: str, *operands: np.ndarray, **attributes: int) -> Edit:
-    """An op between the graph and the first output."""
-
-    def edit(model: onnx.ModelProto) -> None:
-        graph = model.graph
-        name = graph.output[0].name
-        for node in graph.node:
-            node.output[:] = ["planted" if o == name else o for o in node.output]
-            node.input[:] = ["planted" if i == name else i for i in node.input]
-        given = [constant(model, value) for value in operands]
-        graph.node.append(helper.make_node(op, ["planted", *given], [name], **attributes))
-
-    return edit
-
-
-def other_weights(model: onnx.ModelProto) -> None:
-    for weight in (t for t in model.graph.initializer if len(t.dims) == 2):
-        values = np.random.default_rng(0).standard_normal(weight.dims).astype(np.float32)
-        weight.CopyFrom(numpy_helper.from_array(values, weight.name))
-
-
-def order(size: int, i: int, j: int) -> np.ndarray:
-    places = np.arange(size)
-    places[[i, j]] = j, i
-    return places
+CONTINUOUS = ACTOR.path
 
 
 def planted(source: Path, target: Path, edit: Edit) -> Path:
@@ -82,23 +35,27 @@ def sentences(reference: Path, candidate: Path, pool: RuntimePool) -> list[str]:
     return named
 
 
-WRONG: dict[str, tuple[Path, Edit, str]] = {
-    "columns": (CONTINUOUS, before_input("Gather", order(8, 1, 3), axis=1), "state[1], state[3] exchanged"),
-    "unit": (CONTINUOUS, before_input("Mul", np.float32(180 / np.pi)), "degrees"),
-    "tanh": (CONTINUOUS, after_output("Tanh"), "squashed otherwise"),
-    "scale": (CONTINUOUS, after_output("Mul", np.float32(0.25)), "action[0] is 0.25 ×"),
-    "offset": (CONTINUOUS, after_output("Add", np.float32(0.25)), "+ 0.25"),
-    "clip": (CONTINUOUS, after_output("Clip", np.float32(-0.01), np.float32(0.01)), "clipped to ±0.01"),
-    "actions": (CONTINUOUS, after_output("Gather", order(2, 0, 1), axis=1), "action[0], action[1] exchanged"),
-    "memory": (MEMORY, before_input("Gather", order(5, 1, 3), axis=1), "state[1], state[3] exchanged"),
-}
+def test_sixty_wrong_pairs_are_planted() -> None:
+    """``python -m tests.compare.planted`` counts them all; here are some."""
+    assert len(PAIRS) == 60
+    assert sum(bool(pair.words) for pair in PAIRS.values()) >= 50
 
 
-@pytest.mark.parametrize("name", WRONG)
+@pytest.mark.parametrize("name", [*islice(PAIRS, 0, None, 6), "gru: reset"])
 def test_a_difference_is_called_what_it_is(name: str, tmp_path: Path, pool: RuntimePool) -> None:
-    source, edit, words = WRONG[name]
-    (sentence,) = sentences(source, planted(source, tmp_path / "wrong.onnx", edit), pool)
-    assert words in sentence
+    pair = PAIRS[name]
+    report, named = compared(pair, tmp_path, pool)
+    assert report.passed is False
+    assert is_named(pair, named) == bool(pair.words), named
+
+
+def test_no_sentence_speaks_of_a_log() -> None:
+    """Every text of the table of causes that is said of a log and its policy is said of the two sides here."""
+    code = re.sub(r'"""[^"]*"""', "", Path(causes.__file__).read_text())
+    said = [s for s in re.findall(r'"([^"\n]*)"', code) if re.search(r"\blog\b|logged|the policy", s) and " " in s]
+    assert len(said) > 20
+    for sentence in said:
+        assert not re.search(r"\blog\b|logged|policy\b", in_sides(sentence, "candidate", "reference")), sentence
 
 
 @pytest.mark.parametrize("right", [False, True])
