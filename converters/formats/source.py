@@ -19,6 +19,10 @@ from export_model.converters.policy.facts import SourceFacts
 from export_model.signatures.errors import ExportModelError
 from export_model.signatures.spec import SourceMap
 
+#: An option of a run for which a child imports TensorFlow's Python first, more than what a file from anyone may take;
+#: the model is the user's own.
+BUILT_BY_PYTHON: Mapping[str, Any] = {"answered": True}
+
 
 class OriginalRun(Struct, frozen=True):
     """How the source itself is run, for comparison: a runtime, and what its child process is told to load.

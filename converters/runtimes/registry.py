@@ -17,7 +17,6 @@ __all__ = ["RUNTIMES", "Runtime", "RuntimeInfo", "available_runtimes"]
 ROOMS = (
     "numpy",
     "tensorflow",
-    "tensorflow1",
     "onnxruntime",
     "javascript",
     "litert",

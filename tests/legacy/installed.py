@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from export_model.converters.runtimes.tensorflow1.install import install
-from export_model.converters.runtimes.tensorflow1.release import RELEASES, Release
+from export_model.converters.runtimes.tensorflow.install import install
+from export_model.converters.runtimes.tensorflow.release import RELEASES, Release
 from export_model.signatures.errors import RuntimeUnavailableError
 
 #: A parameter per version, in a group of its own: with several test processes each is started in one of them only.

@@ -19,7 +19,7 @@ from export_model.converters.files.children.process import RunFailedError
 from export_model.converters.formats.frozen_graph.reader import read_graph
 from export_model.converters.policy.policy import Policy
 from export_model.converters.runtimes.pool import RuntimePool
-from export_model.converters.runtimes.tensorflow1.release import RELEASES
+from export_model.converters.runtimes.tensorflow.release import RELEASES
 from export_model.exporter.export.pipeline import ExportOptions, ExportResult, export
 from export_model.exporter.verify.findings import Finding
 from export_model.exporter.verify.participants import PolicyUnderTest

@@ -12,7 +12,7 @@ from export_model.converters.consumers.profiles import TFSHARP
 from export_model.converters.formats.frozen_graph.reader import read_graph
 from export_model.converters.policy.policy import Policy
 from export_model.converters.runtimes.pool import RuntimePool
-from export_model.converters.runtimes.tensorflow1 import RELEASES
+from export_model.converters.runtimes.tensorflow import RELEASES
 from export_model.signatures.errors import ProfileError
 from fixtures import FIXTURES
 from fixtures import path as fixture

@@ -15,7 +15,7 @@ from export_model.converters.formats.registry import DEFAULTS, WRITTEN
 from export_model.converters.graph.ops.approximations import APPROXIMATIONS, RANGES
 from export_model.converters.runtimes.pool import RuntimePool
 from export_model.converters.runtimes.registry import RUNTIMES, available_runtimes
-from export_model.converters.runtimes.tensorflow1.release import RELEASES
+from export_model.converters.runtimes.tensorflow.release import RELEASES
 from export_model.exporter.export.pipeline import ExportOptions, export
 from tests.handmade import constant, graph_bytes, node, placeholder
 from tests.legacy.installed import ensure

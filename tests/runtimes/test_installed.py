@@ -12,7 +12,7 @@ from export_model.converters.files.children.process import RuntimeProcess
 from export_model.converters.runtimes.installed import STAMP, check
 from export_model.converters.runtimes.javascript.node import JS_SOURCE, js_home
 from export_model.converters.runtimes.registry import RUNTIMES
-from export_model.converters.runtimes.tensorflow1.release import LIBRARIES, RELEASES
+from export_model.converters.runtimes.tensorflow.release import LIBRARIES, RELEASES
 from export_model.signatures.digest import sha256_hex
 from export_model.signatures.errors import RuntimeUnavailableError
 from tests.runtimes.pipe import NEEDS_NODE
@@ -89,7 +89,7 @@ def test_a_file_that_was_put_beside_them_is_not_run(tmp_path: Path) -> None:
 def test_a_library_of_tensorflow_1_that_was_changed_is_not_loaded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("export_model.converters.runtimes.tensorflow1.library_folder", lambda release: tmp_path)
+    monkeypatch.setattr("export_model.converters.runtimes.tensorflow.library_folder", lambda release: tmp_path)
     for name in LIBRARIES:
         (tmp_path / name).write_bytes(b"\x7fELF")
     assert RELEASES[0].libraries.keys() == {*LIBRARIES}

@@ -10,13 +10,12 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from export_model.converters.runtimes import tensorflow1 as found
+from export_model.converters.runtimes import tensorflow as found
 from export_model.converters.runtimes.registry import Runtime, RuntimeInfo
-from export_model.converters.runtimes.tensorflow1 import RUNTIMES
-from export_model.converters.runtimes.tensorflow1 import install as legacy_install
-from export_model.converters.runtimes.tensorflow1 import release as legacy
-from export_model.converters.runtimes.tensorflow1.install import install, weaken_python_symbols
-from export_model.converters.runtimes.tensorflow1.release import (
+from export_model.converters.runtimes.tensorflow import install as legacy_install
+from export_model.converters.runtimes.tensorflow import release as legacy
+from export_model.converters.runtimes.tensorflow.install import install, weaken_python_symbols
+from export_model.converters.runtimes.tensorflow.release import (
     API_LIBRARY,
     LIBRARIES,
     RELEASES,
@@ -26,6 +25,7 @@ from export_model.converters.runtimes.tensorflow1.release import (
 from export_model.signatures.digest import sha256_hex
 from export_model.signatures.errors import RuntimeUnavailableError
 
+RUNTIMES = found.RUNTIMES[-len(RELEASES) :]
 RELEASE = RELEASES[0]
 NOT_HERE = "TensorFlow 1.4 and 1.7 are there for Linux on x86-64 with glibc only"
 
@@ -119,7 +119,7 @@ def test_what_lies_in_the_cache_is_installed(
     assert runtime.find() == RuntimeInfo(release.runtime, True, release.version, how)
     with pytest.raises(RuntimeUnavailableError, match="is not the file that was installed"):
         runtime.command()
-    monkeypatch.setattr("export_model.converters.runtimes.tensorflow1.check", lambda *known: None)
+    monkeypatch.setattr("export_model.converters.runtimes.tensorflow.check", lambda *known: None)
     assert runtime.command()[-2:] == [release.runtime, str(folder / API_LIBRARY)]
 
 

@@ -27,6 +27,7 @@ LIMIT = 10.0
 FORMATS = {
     **dict.fromkeys(("tf1.4", "tf1.7"), FROZEN_GRAPH),
     "tensorflow": SAVED_MODEL,
+    "tensorflow-python": SAVED_MODEL,
     "onnxruntime": ONNX,
     "openvino": ONNX,
     "litert": LITERT,

@@ -28,6 +28,6 @@ FORMATS = (
         inner=_artifact.inner,
         unity=True,
         graph=_artifact.graph,
-        runtimes=("numpy", "tensorflow", "tf1.4", "tf1.7"),
+        runtimes=("numpy", "tensorflow", "tensorflow-python", "tf1.4", "tf1.7"),
     ),
 )

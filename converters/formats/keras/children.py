@@ -73,7 +73,7 @@ def frozen_by_tensorflow(path: Path) -> tuple[bytes, ModelSignature]:
         )
     try:
         with RuntimeProcess(
-            "tensorflow", child_command("export_model.converters.runtimes.tensorflow.child")
+            "tensorflow", child_command("export_model.converters.runtimes.tensorflow.python")
         ) as process:
             answer = process.load(str(path.absolute()), kind="keras").run({}, ["graph", "names"])
     except RunFailedError as error:

@@ -14,7 +14,7 @@ from typing import Any
 from export_model.converters.formats.frozen_graph.reader import read_graph
 from export_model.converters.formats.live.freeze import keras_call, keras_outputs, named_function, saved_function
 from export_model.converters.formats.saved_model.signature import expose_signature, signature_of
-from export_model.converters.formats.source import OriginalRun, SourceModel
+from export_model.converters.formats.source import BUILT_BY_PYTHON, OriginalRun, SourceModel
 from export_model.signatures.errors import SourceError, UsageError
 
 NAME = "policy"
@@ -120,5 +120,5 @@ def _read(tensorflow: Any, concrete: Callable[[], Any], folder: Path, name: str)
         ) from error
     graph = read_graph(frozen.graph_def.SerializeToString(deterministic=True))
     graph, facts = expose_signature(graph, signature_of(frozen.inputs, frozen.outputs, frozen.signature))
-    options = {"kind": "function", "form": "saved_model", "signature": frozen.signature}
+    options = {"kind": "function", "form": "saved_model", "signature": frozen.signature, **BUILT_BY_PYTHON}
     return SourceModel(graph, (), facts, name, OriginalRun("tensorflow", folder, options))

@@ -18,7 +18,7 @@ from export_model.converters.formats.checkpoint.policy_nodes import policy_nodes
 from export_model.converters.formats.checkpoint.tensor_bundle import Extents, several
 from export_model.converters.formats.checkpoint.training_graph import Saved, TrainingGraph, training_graph
 from export_model.converters.formats.live.freeze import flatten_graph
-from export_model.converters.formats.source import OriginalRun, SourceModel
+from export_model.converters.formats.source import BUILT_BY_PYTHON, OriginalRun, SourceModel
 from export_model.converters.graph.ops.table import VARIABLES
 from export_model.converters.policy.facts import SourceFacts
 from export_model.signatures.errors import NotAPolicyError, SourceError, UsageError
@@ -68,7 +68,7 @@ def read_session(tensorflow: Any, session: Any, folder: Path) -> SourceModel:
     frozen, notes = policy_nodes(freeze(TrainingGraph(graph, places), SessionValues(values)).graph)
     (folder / _GRAPH).write_bytes(data)
     np.savez(folder / _VALUES, *values.values())
-    options = {"kind": "values", "names": list(values)}
+    options = {"kind": "values", "names": list(values), **BUILT_BY_PYTHON}
     original = OriginalRun("tensorflow", folder / _GRAPH, options)
     return SourceModel(frozen, (), SourceFacts(notes=notes), NAME, original)
 

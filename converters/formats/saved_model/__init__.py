@@ -39,7 +39,7 @@ FORMATS = (
         vetted=_vetted.safe_copy,
         inner=_artifact.inner,
         graph=_artifact.graph,
-        runtimes=("tensorflow",),
+        runtimes=("tensorflow", "tensorflow-python"),
         signatures=True,
     ),
 )

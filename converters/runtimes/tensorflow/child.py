@@ -1,136 +1,71 @@
-"""TensorFlow in its own process: graphs in a Session, SavedModels through a signature.
+"""TensorFlow in its own process, by its C interface.
 
-What a model is loaded from, by ``kind``: ``graph`` (a frozen GraphDef), ``values`` (the training graph of a session of
-the user's, its variables' values in the numpy archive beside it, in the order of ``names``), ``function`` (a
-SavedModel of TensorFlow 2 or a Keras model, as TensorFlow itself freezes it), ``saved_model`` (a SavedModel called by
-``signature``), ``keras`` (a Keras model of Keras' own layers, which is not run but given back as bytes: its GraphDef as
-``graph``, a JSON object of its inputs' and outputs' tensors as ``names``).
-
-``python -m export_model.converters.runtimes.tensorflow.child``
+``python -m export_model.converters.runtimes.tensorflow.child NAME LIBRARY``
+NAME is the runtime's, LIBRARY the path of the shared object that has the C API. TensorFlow 2 runs graphs and our own
+SavedModels so; its Python is imported (2 s, 200 MiB) for what it alone builds (python.py), and does all of it where
+the library does not load. An assertion within TensorFlow ends this process, not its parent.
 """
 
 from __future__ import annotations
 
-import json
-import os
+import ctypes
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from export_model.converters.files import tensorflow_messages as schema
 from export_model.converters.files.children.child import Model, claim_stdout, serve
 from export_model.converters.files.children.frames import Tensors
-from export_model.converters.formats.live.freeze import FrozenFunction, frozen_function
-from export_model.converters.graph.ops.table import VARIABLES
-from export_model.signatures.errors import ExportModelError
+from export_model.converters.runtimes.tensorflow import python
+from export_model.converters.runtimes.tensorflow.library import Session, TensorFlowError, library_version, load_library
 
 
 def main() -> None:
     """Entry of the child process."""
     out = claim_stdout()
-    # Before the import: no log lines, no oneDNN (it changes rounding), one thread, no search for a GPU.
-    os.environ.update(TF_CPP_MIN_LOG_LEVEL="3", TF_ENABLE_ONEDNN_OPTS="0", CUDA_VISIBLE_DEVICES="-1")
-    import tensorflow as tf  # noqa: TID251  this is the child process
-
-    tf.config.threading.set_intra_op_parallelism_threads(1)
-    tf.config.threading.set_inter_op_parallelism_threads(1)
-
-    class InSession:
-        """A graph in a Session; feeds and fetches are tensor names, inner ones too.
-
-        The doubles of a ``source`` are given as float32, as which they are exported.
-        """
-
-        def __init__(self, graph: Any, *, source: bool = False) -> None:
-            self.source = source
-            settings = tf.compat.v1.ConfigProto(allow_soft_placement=True)
-            self.session = tf.compat.v1.Session(graph=graph, config=settings)
-
-        def run(self, feeds: Tensors, fetch: Sequence[str], request: Mapping[str, Any]) -> Tensors:
-            given = {_tensor(name): self._fitting(_tensor(name), array) for name, array in feeds.items()}
-            values = self.session.run([_tensor(n) for n in fetch], given)
-            if self.source:
-                values = [v.astype(np.float32) if v.dtype == np.float64 else v for v in values]
-            return dict(zip(fetch, values, strict=True))
-
-        def _fitting(self, name: str, array: Any) -> Any:
-            """A row as a source takes it that has no axis for the agents."""
-            shape = self.session.graph.get_tensor_by_name(name).shape
-            alone = shape.is_fully_defined() and shape.rank != array.ndim and shape.num_elements() == array.size
-            return array.reshape(shape.as_list()) if alone else array
-
-    def import_graph(definition: Any) -> Any:
-        for node in definition.node:
-            node.device = ""
-        graph = tf.Graph()
-        with graph.as_default():
-            tf.import_graph_def(definition, name="")
-        return graph
-
-    def load_frozen(path: str, *, source: bool) -> InSession:
-        return InSession(import_graph(tf.compat.v1.GraphDef.FromString(Path(path).read_bytes())), source=source)
-
-    def load_with_values(path: str, names: Sequence[str]) -> InSession:
-        """A training graph with values that were read from a session; variables are told by their nodes' names."""
-        model = load_frozen(path, source=True)
-        with np.load(f"{path}.npz", allow_pickle=False) as kept:
-            values = {name: kept[f"arr_{i}"] for i, name in enumerate(names)}
-        graph = model.session.graph
-        with graph.as_default():
-            for operation in graph.get_operations():
-                value = values.get(operation.name)
-                if value is not None and operation.type == "VarHandleOp":
-                    model.session.run(tf.raw_ops.AssignVariableOp(resource=operation.outputs[0], value=value))
-                elif value is not None and operation.type in VARIABLES:
-                    model.session.run(tf.raw_ops.Assign(ref=operation.outputs[0], value=value).op)
-        return model
-
-    class Saved:
-        """A SavedModel, called as TensorFlow 2 does: one signature, inputs by name."""
-
-        def __init__(self, path: str, signature: str) -> None:
-            self.keep = tf.saved_model.load(path)
-            self.function = self.keep.signatures[signature]
-
-        def run(self, feeds: Tensors, fetch: Sequence[str], request: Mapping[str, Any]) -> Tensors:
-            results = self.function(**{name: tf.constant(array) for name, array in feeds.items()})
-            return {name: results[name].numpy() for name in fetch}
-
-    def load(header: Mapping[str, Any]) -> Model:
-        kind, path = header["kind"], header["path"]
-        if kind == "saved_model":
-            return Saved(path, header.get("signature", "serving_default"))
-        if kind == "values":
-            return load_with_values(path, header["names"])
-        if kind == "keras":
-            from export_model.converters.formats.keras.config import config_inside, refuse_code
-
-            refuse_code(config_inside(path), built=True)
-            return _Frozen(frozen_function(path, "keras"))
-        if kind == "function":
-            definition = frozen_function(path, header["form"], header.get("signature")).graph_def
-            return InSession(import_graph(definition), source=True)
-        return load_frozen(path, source=header.get("source", False))
-
-    faults = (tf.errors.OpError, AttributeError, RuntimeError, ImportError, ExportModelError)
-    serve("tensorflow", tf.__version__, load, faults, out)
+    name, path = sys.argv[1:]
+    python.set_environment()
+    try:
+        library = load_library(path)
+    except (OSError, AttributeError):  # another system, or a build without the C API
+        if name != "tensorflow":
+            raise
+        python.serve_python(out)
+    if name != "tensorflow":
+        serve(name, library_version(library), lambda h: Session(library, Path(h["path"])), (TensorFlowError,), out)
+    version = f"{library_version(library)} (C interface)"
+    serve(name, version, lambda header: _load(library, header), (TensorFlowError, *python.FAULTS), out)
 
 
-class _Frozen:
-    def __init__(self, function: FrozenFunction) -> None:
-        self.function = function
+def _load(library: ctypes.CDLL, header: Mapping[str, Any]) -> Model:
+    kind = header["kind"]
+    if kind == "saved_model":
+        return _Saved(library, Path(header["path"]), header.get("signature", "serving_default"))
+    if kind == "graph":
+        return Session(library, Path(header["path"]), fitting=True, source=header.get("source", False))
+    return python.load(header)
+
+
+class _Saved:
+    """A SavedModel, called by one signature, inputs by name."""
+
+    def __init__(self, library: ctypes.CDLL, folder: Path, key: str) -> None:
+        self._session = Session(library, folder, saved=True)
+        meta = schema.parse(schema.MetaGraphDef, self._session.meta_graph, "MetaGraphDef")
+        self._session.meta_graph = b""
+        if key not in meta.signature_def:
+            raise TensorFlowError(f"the SavedModel has no signature {key!r}")
+        signature = meta.signature_def[key]
+        self._inputs = {name: info.name for name, info in signature.inputs.items()}
+        self._outputs = {name: info.name for name, info in signature.outputs.items()}
 
     def run(self, feeds: Tensors, fetch: Sequence[str], request: Mapping[str, Any]) -> Tensors:
-        function = self.function
-        names = {"inputs": function.inputs, "outputs": function.outputs, "signature": function.signature}
-        graph = function.graph_def.SerializeToString(deterministic=True)
-        return {name: np.frombuffer(data, np.uint8) for name, data in
-                (("graph", graph), ("names", json.dumps(names).encode()))}  # fmt: skip
-
-
-def _tensor(name: str) -> str:
-    return name if ":" in name else f"{name}:0"
+        if feeds.keys() != self._inputs.keys():
+            raise TensorFlowError(f"the signature takes {sorted(self._inputs)}, and {sorted(feeds)} were fed")
+        tensors = {self._outputs[name]: name for name in fetch}
+        answers = self._session.run({self._inputs[name]: a for name, a in feeds.items()}, list(tensors))
+        return {name: answers[self._outputs[name]] for name in fetch}
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from export_model.converters.runtimes.base import Progress
 from export_model.converters.runtimes.installed import built_beside, carried_out
-from export_model.converters.runtimes.tensorflow1.release import (
+from export_model.converters.runtimes.tensorflow.release import (
     API_LIBRARY,
     LIBRARIES,
     Release,
