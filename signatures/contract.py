@@ -102,7 +102,7 @@ class Origin(Record, frozen=True):
     normaliser: Text | None = None
 
 
-class Code(TypedDict, total=False):
+class CodeSection(TypedDict, total=False):
     """How source code was written, where not as usual.
 
     - ``math``: mathematical functions are the source code's own, the same bits on every processor (--math).
@@ -134,7 +134,7 @@ class Tool(TypedDict):
     profile: NotRequired[Text]
     weights: NotRequired[Literal["float16", "int8"]]
     batch: NotRequired[Annotated[int, Meta(ge=1, le=2**63 - 1)]]
-    code: NotRequired[Code]
+    code: NotRequired[CodeSection]
     bake: NotRequired[Literal["actions"]]
 
 
@@ -151,7 +151,7 @@ class Preprocess(TypedDict):
     from_bytes: Text
 
 
-class Head(Struct, frozen=True):
+class ContractHead(Struct, frozen=True):
     """What a contract says beside the policy's signature.
 
     - ``name``: the policy's name, which its files have.
@@ -241,7 +241,7 @@ def parse(content: Any) -> Contract:
         raise FieldError(WHOLE, "must be an object")
     if content.get("schema") != SCHEMA:
         raise FieldError("schema", f"is {str(content.get('schema'))[:20]!r}, and this version reads {SCHEMA}")
-    head: Head = read(content, Head)
+    head: ContractHead = read(content, ContractHead)
     signature = parse_signature(content)
     for path in head.files:
         _check_path(path)

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from export_model.converters.compiler.options import CompileOptions
 from export_model.converters.graph.nodes import Graph, SourceName
 from export_model.converters.policy.action import ActionMeaning
-from export_model.converters.policy.brains import Brain
+from export_model.converters.policy.brains import GraphBrain
 from export_model.converters.policy.facts import SourceFacts
 from export_model.signatures.memories import SourcePart
 from export_model.signatures.roles import Role
@@ -23,7 +23,7 @@ class Compilation(Struct, frozen=True):
     """A brain's graph, and what is known of it so far; each pass returns a new one."""
 
     graph: Graph
-    brain: Brain
+    brain: GraphBrain
     options: CompileOptions
     facts: SourceFacts
     #: the source's graph, before any placeholder got a value

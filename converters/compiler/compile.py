@@ -28,14 +28,14 @@ from export_model.converters.compiler.passes.signature import sign, source_map, 
 from export_model.converters.compiler.passes.simplify import collapse_views, drop_identities
 from export_model.converters.compiler.passes.small_integers import widen_small_integers
 from export_model.converters.compiler.passes.transposes import cancel_transposes
-from export_model.converters.compiler.passes.unroll import MAX_NODES, unroll
+from export_model.converters.compiler.passes.unroll import MAX_POLICY_NODES, unroll
 from export_model.converters.graph.nodes import Graph, Node, SourceName, node_of, split_ref, topological
 from export_model.converters.graph.ops.table import is_fed
-from export_model.converters.policy.brains import Brain, explain_outputs, find_brains
+from export_model.converters.policy.brains import GraphBrain, explain_outputs, find_brains
 from export_model.converters.policy.facts import SourceFacts
 from export_model.converters.policy.inputs import classify_inputs, explain_inputs
 from export_model.converters.policy.policy import Policy
-from export_model.converters.policy.rules import Decision
+from export_model.converters.policy.rules import RoleDecision
 from export_model.signatures.errors import NotAPolicyError, UsageError
 from export_model.signatures.roles import OBSERVATIONS
 
@@ -108,7 +108,7 @@ def compilations(graph: Graph, options: CompileOptions, facts: SourceFacts) -> l
         outputs = [(canonical[base], reference) for base, _, reference in brain.outputs if base in canonical]
         upstream = graph.prune([reference for _, reference in outputs])
         for what, count, most in (
-            ("nodes", len(upstream.nodes), MAX_NODES),
+            ("nodes", len(upstream.nodes), MAX_POLICY_NODES),
             ("tensors that its nodes read", sum(len(n.inputs) for n in upstream.nodes), MAX_READ),
             ("inputs", sum(map(is_fed, upstream.nodes)), MAX_PORTS),
             ("outputs", len(outputs), MAX_PORTS),
@@ -143,7 +143,7 @@ def compilations(graph: Graph, options: CompileOptions, facts: SourceFacts) -> l
 
 def explanations(
     graph: Graph, name: str, options: CompileOptions | None = None, facts: SourceFacts | None = None
-) -> dict[str, tuple[Decision, ...]]:
+) -> dict[str, tuple[RoleDecision, ...]]:
     """Policy → why its inputs and outputs have their roles, by the source's names. Raises as ``compile_graph``."""
     with np.errstate(all="ignore"):
         joined = _prepare(graph, options or CompileOptions(), facts or SourceFacts())
@@ -206,7 +206,7 @@ def _by_nodes(graph: Graph, options: CompileOptions) -> CompileOptions:
     return replace(options, inputs=rekey(options.inputs), outputs=rekey(options.outputs), values=rekey(options.values))
 
 
-def _chosen_brains(brains: tuple[Brain, ...], wanted: str | None) -> tuple[Brain, ...]:
+def _chosen_brains(brains: tuple[GraphBrain, ...], wanted: str | None) -> tuple[GraphBrain, ...]:
     if wanted is None:
         return brains
     chosen = tuple(b for b in brains if b.label == wanted)

@@ -10,7 +10,7 @@ from export_model.converters.consumers.unity.consumers import CONSUMERS, EARLIER
 from export_model.converters.consumers.unity.exceptions import exception_of
 from export_model.converters.consumers.unity.importers import IMPORTERS
 from export_model.converters.consumers.unity.players import PLAYERS, Row
-from export_model.converters.consumers.unity.readings import RULES, Reading, Rule
+from export_model.converters.consumers.unity.readings import RULES, Form, Reading
 
 _THROWN = (Reading.REFUSED, Reading.FAILS)
 
@@ -47,7 +47,7 @@ def consumer_tables() -> dict[str, Any]:
     }
 
 
-def _readings(rule: Rule) -> Iterator[dict[str, Any]]:
+def _readings(rule: Form) -> Iterator[dict[str, Any]]:
     """A record for each importer that a rule concerns."""
     newest = tuple(IMPORTERS)[-1]
     for importer in rule.importers:

@@ -29,7 +29,7 @@ LARGE_FILE = 1 << 20
 #: Protobuf's own limit.
 MAX_MESSAGE = (2 << 30) - 1
 #: Fields of a message that are looked through: a graph has no more than 131,072 nodes.
-MAX_FIELDS = 1 << 18
+MAX_MODEL_FIELDS = 1 << 18
 _SECRET = os.urandom(16)
 _MARK = re.compile(re.escape(_SECRET) + b".{8}", re.DOTALL)
 _MARK_BYTES = len(_SECRET) + 8
@@ -78,7 +78,7 @@ class Detached:
         parts: list[bytes | memoryview] = []
         kept = 0
         try:
-            for number, tag_end, start, end in _large_fields(view, LARGE, MAX_FIELDS):
+            for number, tag_end, start, end in _large_fields(view, LARGE, MAX_MODEL_FIELDS):
                 if number not in fields:
                     continue
                 inner = fields[number]

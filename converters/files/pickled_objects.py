@@ -27,8 +27,8 @@ from export_model.converters.files.unpickle import (
     OPCODES,
     SYSTEM,
     Function,
-    Machine,
     PickledDtype,
+    PickleMachine,
     carry_out,
     damaged_error,
     refusal,
@@ -94,7 +94,7 @@ def _no_storage(identity: tuple[Any, ...]) -> Any:
     raise damaged_error("a tensor stands where none belongs")
 
 
-class _Objects(Machine):
+class _Objects(PickleMachine):
     """A machine for which every other class is a name."""
 
     def __init__(self, storage: Callable[[tuple[Any, ...]], Any], names: Mapping[tuple[str, str], Any]) -> None:

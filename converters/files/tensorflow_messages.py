@@ -23,7 +23,7 @@ from export_model.signatures.dtypes import DATA_TYPES
 from export_model.signatures.errors import DamagedFileError, NotAPolicyError
 
 #: Nodes of a file, training part and functions included.
-MAX_NODES = 1 << 17
+MAX_GRAPHDEF_NODES = 1 << 17
 
 #: Graphs of a SavedModel, one for each set of tags.
 _MAX_GRAPHS = 1 << 6
@@ -139,10 +139,10 @@ def _graphs(message: Any) -> list[Any]:
 
 def check_nodes(count: int) -> None:
     """Raise NotAPolicyError where a file has more nodes than any is read with."""
-    if count > MAX_NODES:
+    if count > MAX_GRAPHDEF_NODES:
         raise NotAPolicyError(
             f"the graph has {count} nodes",
-            why=f"no more than {MAX_NODES} are read; the training graphs of ML-Agents have some thousands",
+            why=f"no more than {MAX_GRAPHDEF_NODES} are read; the training graphs of ML-Agents have some thousands",
             fix="freeze the policy's own outputs",
         )
 

@@ -19,7 +19,7 @@ from typing import Any, Literal
 import numpy as np
 from msgspec import Struct
 
-from export_model.converters.files.unpickle import StorageType, Tensor, unpickle
+from export_model.converters.files.unpickle import PickledTensor, StorageType, unpickle
 from export_model.converters.files.zip_archives import ZIP_ERRORS, open_archive
 from export_model.signatures.errors import DamagedFileError, NotAPolicyError
 
@@ -51,7 +51,7 @@ class Archive:
         self._given = 0
         self.value = self._zip() if self._data.startswith(b"PK\x03\x04") else self._row()
 
-    def array(self, tensor: Tensor, name: str) -> np.ndarray:
+    def array(self, tensor: PickledTensor, name: str) -> np.ndarray:
         """A tensor's numbers (bfloat16 as float32), a view of the file's bytes where it can be. ``name`` is for errors.
 
         Raises DamagedFileError where they do not lie in their storage.

@@ -40,7 +40,7 @@ class StorageType(Struct, frozen=True):
     dtype: str
 
 
-class Tensor(Struct, frozen=True):
+class PickledTensor(Struct, frozen=True):
     """A tensor as it is pickled: a storage, where in it the tensor begins, and the steps along each axis (elements)."""
 
     storage: Any
@@ -96,10 +96,10 @@ def unpickle(stream: IO[bytes], storage: Callable[[tuple[Any, ...]], Any]) -> An
     ``storage`` makes what a persistent id stands for. Raises NotAPolicyError for a name that is not in the table,
     DamagedFileError for a pickle that breaks the rules of its own format.
     """
-    return carry_out(Machine(storage), stream)
+    return carry_out(PickleMachine(storage), stream)
 
 
-def carry_out(machine: Machine, stream: IO[bytes]) -> Any:
+def carry_out(machine: PickleMachine, stream: IO[bytes]) -> Any:
     """Return the value of one pickle, its opcodes carried out by a machine. Raises what ``unpickle`` raises."""
     try:
         with warnings.catch_warnings():  # of escapes in a damaged name, by pickletools
@@ -116,7 +116,7 @@ def carry_out(machine: Machine, stream: IO[bytes]) -> Any:
     raise damaged_error("its pickle has no end")
 
 
-class Machine:
+class PickleMachine:
     """The stack and the memo of a pickle; ``opcodes`` are those that it carries out."""
 
     def __init__(self, storage: Callable[[tuple[Any, ...]], Any]) -> None:
@@ -227,9 +227,9 @@ _VALUES = (
     *("UNICODE", "BINUNICODE", "SHORT_BINUNICODE", "BINUNICODE8", "BINBYTES", "SHORT_BINBYTES", "BINBYTES8"),
 )
 #: What each opcode does with the machine and its argument.
-OPCODES: dict[str, Callable[[Machine, Any], object]] = {
+OPCODES: dict[str, Callable[[PickleMachine, Any], object]] = {
     **dict.fromkeys(("PROTO", "FRAME"), lambda m, _: None),
-    **dict.fromkeys(_VALUES, Machine.push),
+    **dict.fromkeys(_VALUES, PickleMachine.push),
     "MARK": lambda m, _: m.stack.append(MARK),
     "NONE": lambda m, _: m.stack.append(None),
     "NEWTRUE": lambda m, _: m.stack.append(True),
@@ -275,14 +275,14 @@ def _ordered_dict(arguments: tuple[Any, ...]) -> dict[Any, Any]:
     return made
 
 
-def _tensor(arguments: tuple[Any, ...]) -> Tensor:
+def _tensor(arguments: tuple[Any, ...]) -> PickledTensor:
     """``_rebuild_tensor_v2(storage, storage_offset, size, stride, requires_grad, backward_hooks, metadata)``."""
     storage, offset, shape, strides = arguments[:4]
     if not isinstance(shape, tuple) or not isinstance(strides, tuple) or len(shape) != len(strides):
         raise damaged_error("a tensor's shape and strides do not fit together")
     if len(shape) > MAX_AXES or not all(_is_count(n) for n in (offset, *shape, *strides)):
         raise damaged_error("a tensor's shape or strides are none")
-    return Tensor(storage, offset, shape, strides)
+    return PickledTensor(storage, offset, shape, strides)
 
 
 def _encode(arguments: tuple[Any, ...]) -> bytes:

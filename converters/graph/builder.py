@@ -33,7 +33,7 @@ from export_model.converters.graph.types import FLOAT32, INT32, INT64, Dim, Symb
 from export_model.signatures.errors import GraphError, UnsupportedOpError
 
 #: A policy has some hundreds.
-MAX_NODES = 1 << 16
+MAX_BUILT_NODES = 1 << 16
 _SHARED_CONSTANT = 64
 _DAMAGED = "the model is damaged"
 
@@ -124,9 +124,9 @@ class Builder:
 
     def append(self, node: Node) -> str:
         """Take a node in, and infer what it gives; returns its output 0."""
-        if self.typed and len(self.nodes) > MAX_NODES:
+        if self.typed and len(self.nodes) > MAX_BUILT_NODES:
             raise UnsupportedOpError(
-                f"the model unfolds to more than {MAX_NODES} nodes",
+                f"the model unfolds to more than {MAX_BUILT_NODES} nodes",
                 why="a policy has some hundreds",
                 fix="give the policy alone, without the training part",
             )

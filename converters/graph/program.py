@@ -119,7 +119,7 @@ def arena_of(dtype: np.dtype) -> str:
     return "floats" if dtype == FLOAT32 else "longs" if dtype == INT64 else "ints"
 
 
-class _Builder:
+class _ProgramBuilder:
     def __init__(self, graph: Graph) -> None:
         self.types = infer_types(graph)
         self.tensors: dict[str, Tensor] = {}
@@ -216,7 +216,7 @@ def program_of(graph: Graph, feeds: Mapping[str, str], fetches: Mapping[str, str
     Raises UnsupportedOpError.
     """
     graph = Graph(tuple(_for_one(n) for n in graph.nodes)).prune(fetches.values())
-    builder = _Builder(graph)
+    builder = _ProgramBuilder(graph)
     inputs: dict[str, Tensor] = {}
     names = {placeholder: name for name, placeholder in feeds.items()}
     for node in graph.nodes:

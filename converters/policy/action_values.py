@@ -35,7 +35,7 @@ _BOUNDED = frozenset(("sigmoid", "tanh", "softmax", "softsign", "relu 6"))
 _MOST_STEPS = 32
 
 
-class Candidate(Struct, frozen=True):
+class OutputCandidate(Struct, frozen=True):
     """An output that may be a continuous action or values of actions.
 
     ``graph`` is normalised and folded, ``tensor`` its tensor; ``name`` is what the source calls it, ``layer`` the names
@@ -55,19 +55,19 @@ class Evidence(Struct, frozen=True):
 
     said: str
     seen: str
-    holds: Callable[[Candidate], bool]
+    holds: Callable[[OutputCandidate], bool]
 
 
-def _has_q_name(given: Candidate) -> bool:
+def _has_q_name(given: OutputCandidate) -> bool:
     return is_q_name(given.name)
 
 
-def _made_by_q_network(given: Candidate) -> bool:
+def _made_by_q_network(given: OutputCandidate) -> bool:
     words = (word for name in (given.model, *given.layer) for word in re.split(r"[/.:]", name))
     return any(_Q_NETWORKS.fullmatch(plain_name(word)) for word in words)
 
 
-def _dueling(given: Candidate) -> bool:
+def _dueling(given: OutputCandidate) -> bool:
     terms = _summands(given.graph, given.tensor)
     added = {ref for ref, sign in terms if sign > 0}
     for reference, sign in terms:
@@ -78,7 +78,7 @@ def _dueling(given: Candidate) -> bool:
     return False
 
 
-def _trained_by_regression(given: Candidate) -> bool:
+def _trained_by_regression(given: OutputCandidate) -> bool:
     return _REGRESSION.fullmatch(plain_name(given.loss)) is not None and _is_linear(given.graph, given.tensor)
 
 
@@ -112,7 +112,7 @@ def is_q_name(name: str) -> bool:
     return Q_NAMES.fullmatch(plain_name(name)) is not None
 
 
-def evidence_of(given: Candidate) -> Evidence | None:
+def evidence_of(given: OutputCandidate) -> Evidence | None:
     """The first sign that an output values actions; None: it may be a continuous action as well."""
     return next((e for e in EVIDENCE if e.holds(given)), None)
 
@@ -122,7 +122,7 @@ def says_action(name: str) -> bool:
     return _ACTION_NAMES.fullmatch(plain_name(name)) is not None
 
 
-def is_state_value(given: Candidate) -> bool:
+def is_state_value(given: OutputCandidate) -> bool:
     """Whether an output of one number a row is called a value (of a state, or of a given action), or its weights are.
 
     An actor's layer may be called so in part (``actor_critic.actor``): the output's name or the layer's decides then.

@@ -18,7 +18,7 @@ from export_model.converters.graph.ops.table import CONTROL_FLOW, is_fed, passes
 from export_model.converters.policy.action_values import says_action
 from export_model.converters.policy.given_outputs import check_given, outputs_from_user
 from export_model.converters.policy.memories import looks_like_state
-from export_model.converters.policy.rules import Decision, Rule
+from export_model.converters.policy.rules import RoleDecision, Rule
 from export_model.signatures.errors import NotAPolicyError, SignatureError
 from export_model.signatures.roles import (
     ACTING,
@@ -57,7 +57,7 @@ class Head(Struct, frozen=True):
         return f"deterministic_{self.name}"
 
 
-class Brain(Struct, frozen=True):
+class GraphBrain(Struct, frozen=True):
     """One policy of a graph: its scope (``""`` or ``"GoalieBrain/"``) and where its outputs are."""
 
     scope: str
@@ -136,8 +136,8 @@ def find_brains(
     graph: Graph,
     wanted: Mapping[str, Role] | None = None,
     declared: Mapping[str, Role | None] | None = None,
-    told: Mapping[str, Decision] | None = None,
-) -> tuple[Brain, ...]:
+    told: Mapping[str, RoleDecision] | None = None,
+) -> tuple[GraphBrain, ...]:
     """The policies in a graph, in graph order.
 
     ``wanted`` (source output name → role, from ``--output``) decides instead of names. ``declared`` are the outputs
@@ -155,7 +155,9 @@ def find_brains(
         scope = _scope_of(graph, [n for n, role in given.items() if role in ACTING])
         rest = [n for n in declared or () if n in fed and n not in given]
         others = _others(graph, outputs, rest, told)
-        return (Brain(scope, (*outputs, *others), _constants(graph, scope), says=says | _reasons_declared(others)),)
+        return (
+            GraphBrain(scope, (*outputs, *others), _constants(graph, scope), says=says | _reasons_declared(others)),
+        )
     if declared:
         fed &= set(declared)
     scopes = _scopes_with_action(graph, fed)
@@ -165,7 +167,7 @@ def find_brains(
 
 
 def _declared_roles(
-    graph: Graph, declared: Mapping[str, Role | None], told: Mapping[str, Decision], fed: set[str]
+    graph: Graph, declared: Mapping[str, Role | None], told: Mapping[str, RoleDecision], fed: set[str]
 ) -> tuple[dict[str, Role], dict[str, str]]:
     """Return the roles that the format knows of its outputs, and why; an argmax beside values is the action."""
     given = {n: role for n, role in declared.items() if role is not None and n in fed}
@@ -189,15 +191,15 @@ def _scopes_with_action(graph: Graph, fed: set[str]) -> list[str]:
     return [scope for scope, d in scopes.items() if d == depth]
 
 
-def explain_outputs(brain: Brain, told: Mapping[str, Decision]) -> tuple[Decision, ...]:
+def explain_outputs(brain: GraphBrain, told: Mapping[str, RoleDecision]) -> tuple[RoleDecision, ...]:
     """Why a brain's outputs have their roles, and what speaks against it; ``told`` is what the reader decided."""
     found = []
     for _, role, reference in brain.outputs:
         known = told.get(reference)
         against = () if known is None else known.against if known.role is role else (known.says, *known.against)
-        found.append(Decision(reference, role, brain.says.get(reference, _KNOWN), against))
+        found.append(RoleDecision(reference, role, brain.says.get(reference, _KNOWN), against))
     left = "nothing reads it, as an output, and another tensor is the action"
-    return (*found, *(Decision(name, None, left) for name in brain.left_out))
+    return (*found, *(RoleDecision(name, None, left) for name in brain.left_out))
 
 
 def _constants(graph: Graph, scope: str) -> dict[str, Constant]:
@@ -215,7 +217,7 @@ def _constants(graph: Graph, scope: str) -> dict[str, Constant]:
     return found
 
 
-def _brain(graph: Graph, scope: str, fed: set[str]) -> Brain:
+def _brain(graph: Graph, scope: str, fed: set[str]) -> GraphBrain:
     outputs, says = [], {}
     for node in graph.nodes:
         base = node.name[len(scope) :]
@@ -223,7 +225,7 @@ def _brain(graph: Graph, scope: str, fed: set[str]) -> Brain:
         if named and node.name in fed and not is_fed(node):
             outputs.append((base, OUTPUT_NAMES[base], node.name))
             says[node.name] = _BY_NAME.format(OUTPUT_NAMES[base])
-    return Brain(scope, tuple(outputs), _constants(graph, scope), says=says)
+    return GraphBrain(scope, tuple(outputs), _constants(graph, scope), says=says)
 
 
 def depends_on_input(graph: Graph, left_out: Callable[[Node], bool] = lambda node: False) -> set[str]:
@@ -258,8 +260,11 @@ def _shows_one_of(graph: Graph, name: str, nodes: Collection[str]) -> bool:
 
 
 def _brains_from_user(
-    graph: Graph, wanted: Mapping[str, Role], declared: Mapping[str, Role | None] | None, told: Mapping[str, Decision]
-) -> tuple[Brain, ...]:
+    graph: Graph,
+    wanted: Mapping[str, Role],
+    declared: Mapping[str, Role | None] | None,
+    told: Mapping[str, RoleDecision],
+) -> tuple[GraphBrain, ...]:
     outputs = outputs_from_user(graph, wanted)
     nodes = {node_of(reference) for _, _, reference in outputs}
     acted = {n for n, role in (declared or {}).items() if role is Role.ACTION} | {
@@ -270,7 +275,7 @@ def _brains_from_user(
     if Role.ACTION in given or (Role.Q_VALUES in given and not acted):
         scope = _scope_of(graph, [node_of(reference) for _, _, reference in outputs])
         says = {reference: _TOLD for _, _, reference in outputs}
-        brains: tuple[Brain, ...] = (Brain(scope, tuple(outputs), _constants(graph, scope), says=says),)
+        brains: tuple[GraphBrain, ...] = (GraphBrain(scope, tuple(outputs), _constants(graph, scope), says=says),)
         check_given(outputs, [role for _, role, _ in outputs], brains[0].canonical)
         return brains
     # Naming one output is enough to say that the rest is where it always is.
@@ -282,7 +287,7 @@ def _brains_from_user(
     return brains
 
 
-def _give_outputs(brains: tuple[Brain, ...], outputs: Sequence[tuple[str, Role, str]]) -> tuple[Brain, ...]:
+def _give_outputs(brains: tuple[GraphBrain, ...], outputs: Sequence[tuple[str, Role, str]]) -> tuple[GraphBrain, ...]:
     """Return the brains with the user's outputs, each in the innermost scope around it, before their own."""
     named = {reference for _, _, reference in outputs}
     owners = [
@@ -310,8 +315,8 @@ def _scope_of(graph: Graph, names: Sequence[str]) -> str:
 
 
 def _brain_of_sink(
-    graph: Graph, fed: set[str], declared: set[str], known: Mapping[str, Role], told: Mapping[str, Decision]
-) -> Brain:
+    graph: Graph, fed: set[str], declared: set[str], known: Mapping[str, Role], told: Mapping[str, RoleDecision]
+) -> GraphBrain:
     """A graph without a node called ``action``: the one output, or tensor that nothing reads, is the action."""
     read = {node_of(r) for node in graph.nodes for r in node.inputs} - declared
     fed = fed - set(known)
@@ -335,8 +340,8 @@ def _brain_of_sink(
     rest = [n.name for n in (*sinks, *(e for e in echoes if e not in sinks)) if n is not node]
     if declared:
         others = _others(graph, outputs, rest, told)
-        return Brain("", (*outputs, *others), _constants(graph, ""), says=says | _reasons_declared(others))
-    return Brain("", outputs, _constants(graph, ""), tuple(rest), says)
+        return GraphBrain("", (*outputs, *others), _constants(graph, ""), says=says | _reasons_declared(others))
+    return GraphBrain("", outputs, _constants(graph, ""), tuple(rest), says)
 
 
 def _ambiguous_error(sinks: Sequence[Node], chosen: Sequence[Node], why: str) -> SignatureError:
@@ -388,7 +393,7 @@ def _reasons_declared(outputs: Sequence[tuple[str, Role, str]]) -> dict[str, str
 
 
 def _others(
-    graph: Graph, outputs: Sequence[tuple[str, Role, str]], rest: Sequence[str], told: Mapping[str, Decision]
+    graph: Graph, outputs: Sequence[tuple[str, Role, str]], rest: Sequence[str], told: Mapping[str, RoleDecision]
 ) -> list[tuple[str, Role, str]]:
     """Outputs that the format declares and no name explains: kept as they are, under names that nothing else has.
 

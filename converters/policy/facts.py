@@ -7,7 +7,7 @@ from typing import Any
 
 from msgspec import Struct, field
 
-from export_model.converters.policy.rules import Decision
+from export_model.converters.policy.rules import RoleDecision
 from export_model.signatures.interface import Interface
 from export_model.signatures.memories import SeparateMemory
 from export_model.signatures.roles import Constant, Role
@@ -60,4 +60,4 @@ class SourceFacts(Struct, frozen=True):
     model_name: str = ""
     loss: str = ""
     memories: tuple[SeparateMemory, ...] | None = None
-    decisions: Mapping[str, Decision] = field(default_factory=dict)
+    decisions: Mapping[str, RoleDecision] = field(default_factory=dict)

@@ -23,7 +23,7 @@ _IMAGE, _MATRIX = 4, 2
 _COUNTED = (Role.SEQUENCE_LENGTH, Role.BATCH_SIZE, Role.PREV_ACTION)
 
 
-class Named(Struct, frozen=True):
+class ScopedInput(Struct, frozen=True):
     """A placeholder and its name without the scope of its brain."""
 
     base: str
@@ -153,8 +153,10 @@ def _is_mask(seen: Read) -> bool:
 # ------------------------------------------------------------------ the rules
 
 
-def _by_name(pattern: re.Pattern[str], role: Role, ranks: tuple[int, ...] | None, whose: str) -> Rule[Named, Role]:
-    def is_called(given: Named) -> bool:
+def _by_name(
+    pattern: re.Pattern[str], role: Role, ranks: tuple[int, ...] | None, whose: str
+) -> Rule[ScopedInput, Role]:
+    def is_called(given: ScopedInput) -> bool:
         rank = placeholder_rank(given.node)
         if not pattern.fullmatch(given.base) or (ranks is not None and rank is not None and rank not in ranks):
             return False
@@ -234,7 +236,7 @@ LAST_RESORTS: tuple[Rule[Read, Role], ...] = (
 )
 
 
-def contradicted_names(given: Named, role: Role | None) -> tuple[str, ...]:
+def contradicted_names(given: ScopedInput, role: Role | None) -> tuple[str, ...]:
     """What names say of a placeholder whose rank or dtype contradict them, where none is not contradicted."""
     said = list[str]()
     if any(rule.when(given) for rule in BY_NAME):

@@ -11,20 +11,20 @@ from msgspec.structs import replace
 
 from export_model.converters.graph.nodes import Graph, Node, node_of
 from export_model.converters.graph.ops.table import is_fed
-from export_model.converters.policy.brains import Brain
+from export_model.converters.policy.brains import GraphBrain
 from export_model.converters.policy.given_outputs import close_names
 from export_model.converters.policy.input_rules import (
     BY_NAME,
     BY_READERS,
     LAST_RESORTS,
-    Named,
     Read,
+    ScopedInput,
     contradicted_names,
     is_board,
     is_free,
     placeholder_rank,
 )
-from export_model.converters.policy.rules import Decision, against, first
+from export_model.converters.policy.rules import RoleDecision, against, first
 from export_model.signatures.errors import SignatureError, UsageError
 from export_model.signatures.roles import INPUT_ROLES, OBSERVATIONS, Role
 
@@ -34,7 +34,7 @@ _TOLD, _KNOWN, _DEFAULT = "--input says so", "the format says so", "it has a val
 
 def classify_inputs(
     graph: Graph,
-    brain: Brain,
+    brain: GraphBrain,
     wanted: Mapping[str, Role] | None = None,
     known: Mapping[str, Role] | None = None,
     *,
@@ -53,19 +53,19 @@ def classify_inputs(
 
 def explain_inputs(
     graph: Graph,
-    brain: Brain,
+    brain: GraphBrain,
     wanted: Mapping[str, Role],
     known: Mapping[str, Role],
-    told: Mapping[str, Decision],
+    told: Mapping[str, RoleDecision],
     *,
     declared: bool,
-) -> tuple[Decision, ...]:
+) -> tuple[RoleDecision, ...]:
     """What ``classify_inputs`` decides, why, and what speaks against it; ``told`` are the reader's own decisions."""
     inputs = _Inputs(graph, brain, wanted, known, declared=declared)
     return tuple(_with_objections(inputs, decision, told.get(decision.tensor)) for decision in inputs.decide().values())
 
 
-def _with_objections(inputs: _Inputs, decision: Decision, told: Decision | None) -> Decision:
+def _with_objections(inputs: _Inputs, decision: RoleDecision, told: RoleDecision | None) -> RoleDecision:
     """A decision with what speaks against it; the reader's own sentence where it decided the same."""
     if told is None or decision.says == _TOLD:
         return replace(decision, against=inputs.against(decision))
@@ -76,7 +76,7 @@ def _with_objections(inputs: _Inputs, decision: Decision, told: Decision | None)
 
 def role_by_name(base: str, node: Node) -> Role | None:
     """The role that a placeholder's name says, if its rank and dtype do not contradict it."""
-    rule = first(BY_NAME, Named(base, node))
+    rule = first(BY_NAME, ScopedInput(base, node))
     return None if rule is None else rule.role
 
 
@@ -86,7 +86,7 @@ class _Inputs:
     def __init__(
         self,
         graph: Graph,
-        brain: Brain,
+        brain: GraphBrain,
         wanted: Mapping[str, Role],
         known: Mapping[str, Role],
         *,
@@ -98,11 +98,11 @@ class _Inputs:
         inputs = {n.name for n in self.found}
         others = {n.name for n in graph.nodes if is_fed(n) and not n.name.startswith(brain.scope)} - inputs
         self.wanted = {name: role for name, role in wanted.items() if node_of(name) not in others}
-        self.decisions: dict[str, Decision] = {}
+        self.decisions: dict[str, RoleDecision] = {}
         self.consumers: Mapping[str, list[Node]] = {}
         self.recurrent = False
 
-    def decide(self) -> dict[str, Decision]:
+    def decide(self) -> dict[str, RoleDecision]:
         """Placeholder → what it is for."""
         for node in self.found:
             self.decisions[node.name] = self._decision_given(node)
@@ -119,10 +119,10 @@ class _Inputs:
             raise self._no_observation_error()
         return self.decisions
 
-    def against(self, decision: Decision) -> tuple[str, ...]:
+    def against(self, decision: RoleDecision) -> tuple[str, ...]:
         """What speaks against a decision."""
         node = self.graph[decision.tensor]
-        named = Named(self._base(node), node)
+        named = ScopedInput(self._base(node), node)
         said = [*against(BY_NAME, named, decision.role), *contradicted_names(named, decision.role)]
         if self.consumers and decision.role is not None:
             rules = (r for r in BY_READERS if r.role is not Role.PARAMETER)  # those tell nothing
@@ -133,7 +133,7 @@ class _Inputs:
         scope = self.brain.scope
         return node.name[len(scope) :] if node.name.startswith(scope) else node.name
 
-    def _decision_given(self, node: Node) -> Decision:
+    def _decision_given(self, node: Node) -> RoleDecision:
         """What the user, the reader or the name says of a placeholder."""
         base = self._base(node)
         override = next((self.wanted.pop(k) for k in (node.name, f"{node.name}:0", base) if k in self.wanted), None)
@@ -143,15 +143,15 @@ class _Inputs:
                     f"--input {node.name}={override}: that is not an input's role",
                     fix=f"one of: {', '.join(INPUT_ROLES)}",
                 )
-            return Decision(node.name, override, _TOLD)
+            return RoleDecision(node.name, override, _TOLD)
         if node.name in self.known:
-            return Decision(node.name, self.known[node.name], _KNOWN)
-        rule = first(BY_NAME, Named(base, node))
+            return RoleDecision(node.name, self.known[node.name], _KNOWN)
+        rule = first(BY_NAME, ScopedInput(base, node))
         if rule is not None:
-            return Decision(node.name, rule.role, rule.says)
+            return RoleDecision(node.name, rule.role, rule.says)
         if node.op == "PlaceholderWithDefault":
-            return Decision(node.name, None, _DEFAULT)
-        return Decision(node.name, Role.PARAMETER, "")
+            return RoleDecision(node.name, None, _DEFAULT)
+        return RoleDecision(node.name, Role.PARAMETER, "")
 
     def _read(self) -> None:
         """Decide what names do not, from what reads it."""
@@ -161,7 +161,7 @@ class _Inputs:
         for node in unknown:
             rule = first(BY_READERS, self._read_of(node))
             assert rule is not None
-            self.decisions[node.name] = Decision(node.name, rule.role, rule.says)
+            self.decisions[node.name] = RoleDecision(node.name, rule.role, rule.says)
         parameters = [n for n in unknown if self.decisions[n.name].role is Role.PARAMETER]
         if self._has_observation():
             free = [n for n in parameters if is_free(n)]
@@ -171,7 +171,7 @@ class _Inputs:
         for last in LAST_RESORTS:
             fitting = [n for n in parameters if last.when(self._read_of(n))]
             if len(fitting) == 1:
-                self.decisions[fitting[0].name] = Decision(fitting[0].name, last.role, last.says)
+                self.decisions[fitting[0].name] = RoleDecision(fitting[0].name, last.role, last.says)
             if fitting:
                 return
 
@@ -214,7 +214,7 @@ class _Inputs:
         said: dict[str, list[str]] = {}
         for node in nodes:
             decision = self.decisions[node.name]
-            clauses = (decision.says, *contradicted_names(Named(self._base(node), node), decision.role))
+            clauses = (decision.says, *contradicted_names(ScopedInput(self._base(node), node), decision.role))
             said.setdefault("; ".join(clauses), []).append(node.name)
         return "".join(f"; {', '.join(names)}: {clause}" for clause, names in said.items())
 

@@ -25,7 +25,7 @@ class Rule(Struct, Generic[Subject, Verdict], frozen=True):
     says: str
 
 
-class Decision(Struct, frozen=True):
+class RoleDecision(Struct, frozen=True):
     """What a tensor is for (None: it is left out), why, and what spoke against it."""
 
     tensor: str

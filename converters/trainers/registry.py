@@ -6,7 +6,7 @@ import importlib
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from export_model.converters.files.unpickle import Tensor
+from export_model.converters.files.unpickle import PickledTensor
 from export_model.converters.trainers.trainer import Rebuilt, Saved, Trainer
 from export_model.signatures.errors import NotAPolicyError, UsageError
 
@@ -80,7 +80,7 @@ def _other_trainer(value: Any) -> str:
 
 def _content(value: Any) -> str:
     if not isinstance(value, dict):
-        return f"a {type(value).__name__.lower()}" if not isinstance(value, Tensor) else "one tensor"
+        return f"a {type(value).__name__.lower()}" if not isinstance(value, PickledTensor) else "one tensor"
     return _first_names(k for k in value if isinstance(k, str)) or "nothing that has a name"
 
 

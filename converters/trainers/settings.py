@@ -18,7 +18,7 @@ from export_model.signatures.errors import SourceError
 
 #: Folders of a run that hold its checkpoints alone: the settings lie one folder up.
 _OF_CHECKPOINTS = re.compile(r"nn|checkpoints|checkpoint_p\d+")
-MAX_LAYERS = 64
+MAX_HIDDEN_LAYERS = 64
 #: Numbers that a layer gives.
 MAX_UNITS = 1 << 16
 
@@ -46,8 +46,8 @@ class Settings:
         """Return the mappings of a list; of a mapping, its values."""
         value = self.values.get(key)
         items = list(value.values()) if isinstance(value, dict) else value
-        if not isinstance(items, list) or len(items) > MAX_LAYERS or not all(isinstance(v, dict) for v in items):
-            raise self.error(key, f"must be a list of at most {MAX_LAYERS} mappings")
+        if not isinstance(items, list) or len(items) > MAX_HIDDEN_LAYERS or not all(isinstance(v, dict) for v in items):
+            raise self.error(key, f"must be a list of at most {MAX_HIDDEN_LAYERS} mappings")
         return [Settings(v, self.file, f"{self._path(key)}[{i}]") for i, v in enumerate(items)]
 
     def text(self, key: str, default: str | None = None) -> str:
@@ -79,8 +79,8 @@ class Settings:
     def sizes(self, key: str) -> list[int]:
         """Return a list of lengths, each at least 1."""
         value = self.values.get(key)
-        if not isinstance(value, list) or len(value) > MAX_LAYERS or not all(map(_is_size, value)):
-            raise self.error(key, f"must be a list of at most {MAX_LAYERS} numbers from 1 to {MAX_UNITS}")
+        if not isinstance(value, list) or len(value) > MAX_HIDDEN_LAYERS or not all(map(_is_size, value)):
+            raise self.error(key, f"must be a list of at most {MAX_HIDDEN_LAYERS} numbers from 1 to {MAX_UNITS}")
         return value
 
     def pair(self, key: str, default: int, least: int = 1) -> tuple[int, int]:

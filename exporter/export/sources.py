@@ -15,7 +15,7 @@ from export_model.converters.formats.format import Format
 from export_model.converters.formats.read import check_options, each_or_refused, fetch, read_models
 from export_model.converters.formats.source import ReadOptions, SourceModel
 from export_model.converters.policy.policy import Policy
-from export_model.converters.policy.rules import Decision
+from export_model.converters.policy.rules import RoleDecision
 from export_model.signatures.errors import ExportModelError, naming
 
 #: File names that say nothing of the policy: the folder's name, its behavior, does.
@@ -58,7 +58,7 @@ class Source(Struct, frozen=True):
             policies = compile_graph(model.graph, self.stem(model), options, model.facts)
             return [(narrow_original(model, policy), policy) for policy in policies]
 
-    def explain(self, model: SourceModel, options: CompileOptions | None) -> dict[str, tuple[Decision, ...]]:
+    def explain(self, model: SourceModel, options: CompileOptions | None) -> dict[str, tuple[RoleDecision, ...]]:
         """Why the tensors of a model's policies have their roles, by policy."""
         with naming(self.path):
             return explanations(model.graph, self.stem(model), options, model.facts)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from export_model.converters.consumers.unity.checker import UnityVerdict
 from export_model.converters.consumers.unity.findings import Thrown
-from export_model.converters.consumers.unity.players import Outcome
+from export_model.converters.consumers.unity.players import PlayOutcome
 from export_model.exporter.markup import Markup, el, svg_file
 
 _WIDTH, _LINE, _MARGIN, _VALUE = 560, 22, 16, 250
@@ -84,7 +84,7 @@ def _messages(verdict: UnityVerdict) -> list[tuple[str, bool]]:
     if chosen is not None:
         found += [(f.message, False) for f in chosen.checks]
         found += [(_exception_text("In the console", chosen.load), False)] if chosen.load is not None else []
-    found += [(f"In play: {f.message}", False) for f in verdict.played if f.outcome is not Outcome.LOADING]
+    found += [(f"In play: {f.message}", False) for f in verdict.played if f.outcome is not PlayOutcome.LOADING]
     return list(dict.fromkeys(found)) or [("No message: the model is accepted.", True)]
 
 

@@ -18,7 +18,7 @@ from export_model.converters.formats.source import ReadOptions
 from export_model.converters.graph.nodes import Graph
 from export_model.converters.interfaces.text import kept_text, loop_lines, tables
 from export_model.converters.policy.policy import Policy
-from export_model.converters.policy.rules import Decision
+from export_model.converters.policy.rules import RoleDecision
 from export_model.exporter.export.sources import read_source
 from export_model.exporter.reports.layers import blocks_of, chain
 from export_model.exporter.tables import count_text, paragraph, size_text, table
@@ -74,7 +74,7 @@ class PolicyInspection(Struct, frozen=True):
     #: action → the layers from an observation to it, in words
     layers: Mapping[str, str] = field(default_factory=dict)
     #: why inputs and outputs have their roles, where it was asked
-    decisions: Sequence[Decision] = ()
+    decisions: Sequence[RoleDecision] = ()
     #: how its .tflite for one agent fits LiteRT for Microcontrollers; None where it has none
     board: Fit | None = None
 
@@ -151,7 +151,7 @@ def inspect_source(
     source = read_source(path, read, refused)
     compiled = source.compile_models(options) if refused is None else source.compiled_or_refused(options, refused)
     found = []
-    decided: dict[str, tuple[Decision, ...]] = {}
+    decided: dict[str, tuple[RoleDecision, ...]] = {}
     for model, policy in compiled:
         if why and policy.name not in decided:
             decided |= source.explain(model, options)
@@ -265,7 +265,7 @@ def _policy_text(inspected: PolicyInspection) -> str:
     return "\n".join(lines)
 
 
-def _reason(decision: Decision) -> dict[str, Any]:
+def _reason(decision: RoleDecision) -> dict[str, Any]:
     return {
         "tensor": decision.tensor,
         "role": decision.role,
@@ -274,7 +274,7 @@ def _reason(decision: Decision) -> dict[str, Any]:
     }
 
 
-def _reason_lines(decisions: Sequence[Decision]) -> list[str]:
+def _reason_lines(decisions: Sequence[RoleDecision]) -> list[str]:
     """A tensor's role and the rule that decided, and what spoke against it."""
     lines = []
     for decision in decisions:

@@ -8,9 +8,9 @@ from typing import Any
 
 from export_model.converters.consumers.unity.checker import ModeVerdict, UnityVerdict, check_file
 from export_model.converters.consumers.unity.consumers import CONSUMERS, consumer
-from export_model.converters.consumers.unity.findings import Finding, Thrown
+from export_model.converters.consumers.unity.findings import Complaint, Thrown
 from export_model.converters.consumers.unity.players import PLAYERS
-from export_model.converters.consumers.unity.playing import Played
+from export_model.converters.consumers.unity.playing import PlayEvent
 from export_model.converters.consumers.unity.settings import Brain, parse_actions, parse_sensors, read_brain
 from export_model.exporter.tables import paragraph
 from export_model.signatures.errors import UsageError
@@ -145,7 +145,7 @@ def _mode_lines(title: str, found: ModeVerdict, known: bool) -> list[str]:
     return [*lines, f"  the Inspector{title}: {'' if listed else 'nothing to say'}".rstrip(), *listed]
 
 
-def _finding_lines(kind: str, said: Finding | Thrown | Played) -> list[str]:
+def _finding_lines(kind: str, said: Complaint | Thrown | PlayEvent) -> list[str]:
     """A finding or an exception: what, where and what to do."""
     lines = []
     for head, text in ((f"{kind}: ", said.message), ("  where: ", said.where), ("  fix: ", said.fix)):

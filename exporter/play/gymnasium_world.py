@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from export_model.exporter.play.worlds import MakeWorld, Outcome, View
+from export_model.exporter.play.worlds import MakeWorld, StepOutcome, WorldView
 from export_model.signatures.errors import UsageError, suggestion
 from export_model.signatures.roles import Role
 from export_model.signatures.spec import PolicySignature, TensorSpec
@@ -47,7 +47,7 @@ class GymnasiumWorld:
                 fix='give them as info["action_mask"], 1 for what is allowed',
             )
 
-    def begin(self, episodes: int, seed: int) -> View:
+    def begin(self, episodes: int, seed: int) -> WorldView:
         """Reset an environment for each episode."""
         while len(self._environments) < episodes:
             self._environments.append(self._make_environment())
@@ -59,7 +59,7 @@ class GymnasiumWorld:
         self._masks = [self._masks_of(self._environments[r], *rows[r]) for r in range(episodes)] if self._masked else []
         return self._view()
 
-    def step(self, continuous: Array | None, discrete: Array | None) -> Outcome:
+    def step(self, continuous: Array | None, discrete: Array | None) -> StepOutcome:
         """Step every environment whose episode goes on."""
         count = len(self._seen)
         rewards, ended, success = np.zeros(count), self._ended.copy(), np.zeros(count, bool)
@@ -74,7 +74,7 @@ class GymnasiumWorld:
         for row in rows if self._masked else ():
             self._masks[row] = self._masks_of(self._environments[row], self._seen[row], self._infos[row])
         self._ended = ended
-        return Outcome(self._view(), rewards, ended, success)
+        return StepOutcome(self._view(), rewards, ended, success)
 
     def _make_environment(self) -> Any:
         with _own_code(self.name, "making it"):
@@ -85,10 +85,10 @@ class GymnasiumWorld:
             seen, info = env.reset(seed=seed)
         return seen, info
 
-    def _view(self) -> View:
+    def _view(self) -> WorldView:
         masks = [m for m in self._masks if m is not None]
         stacked = _observations_of(self._signature, self._seen, self.name)
-        return View(stacked, np.stack(masks).astype(np.float32) if masks else None)
+        return WorldView(stacked, np.stack(masks).astype(np.float32) if masks else None)
 
     def _masks_of(self, env: Any, seen: Any, info: Mapping[str, Any]) -> Array | None:
         for place in (info, seen):

@@ -39,7 +39,7 @@ Progress = Callable[[str], None]
 _MORE = 1 << 31
 
 
-class Played(Struct, frozen=True):
+class PlayedArtifact(Struct, frozen=True):
     """One artefact in one runtime: its episodes, and how their returns compare with the reference's."""
 
     format: str
@@ -78,7 +78,7 @@ class Match:
         self.reference: Episodes | None = None
         #: what played as the reference: ``source/tensorflow``, ``numpy``
         self.reference_name = ""
-        self.played: list[Played] = []
+        self.played: list[PlayedArtifact] = []
         self.notes: tuple[str, ...] = ()
         self.world_name = ""
         #: steps that were kept for the replay
@@ -164,7 +164,7 @@ class Match:
             ) from error
         yield from ()
 
-    def _beside_reference(self, actor: LoadedPolicy, participant: Participant) -> Played:
+    def _beside_reference(self, actor: LoadedPolicy, participant: Participant) -> PlayedArtifact:
         """Return what came of the episodes, those that the reference plays beside them kept for the next."""
         name, runtime = participant.name, participant.runtime
         who = f"{name} in {runtime}"
@@ -180,7 +180,7 @@ class Match:
             return self._more[more]
 
         decided = decide(reference, lambda more: self._episodes(actor, who, more), self._options, self.margin)
-        return Played(name, runtime, *decided)
+        return PlayedArtifact(name, runtime, *decided)
 
     def _actor(self, run: Run, runtime: str, signature: PolicySignature | None = None) -> LoadedPolicy:
         assert self.policy is not None

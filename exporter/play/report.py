@@ -10,7 +10,7 @@ from msgspec import Struct
 
 from export_model.exporter.play.episodes import Episodes
 from export_model.exporter.play.equivalence import mean_interval, scale_of
-from export_model.exporter.play.match import Played
+from export_model.exporter.play.match import PlayedArtifact
 from export_model.exporter.play.options import PlayOptions
 from export_model.exporter.tables import table
 from export_model.exporter.verify.plays import (
@@ -35,7 +35,7 @@ class PlayReport(Struct, frozen=True):
     #: what played as the reference, and its episodes
     reference: str
     episodes: Episodes
-    played: tuple[Played, ...]
+    played: tuple[PlayedArtifact, ...]
     replay: ParityReport
     #: steps that were recorded and fed to everything
     recorded: int
@@ -53,7 +53,7 @@ class PlayReport(Struct, frozen=True):
         return None if NOT_DECIDED in verdicts or not verdicts or self.replay.passed is None else True
 
     @property
-    def undecided(self) -> tuple[Played, ...]:
+    def undecided(self) -> tuple[PlayedArtifact, ...]:
         """What more episodes would decide."""
         return tuple(p for p in self.played if p.compared.verdict == NOT_DECIDED)
 
@@ -150,14 +150,14 @@ class PlayReport(Struct, frozen=True):
         }
 
 
-def _player(played: Played) -> Player:
+def _player(played: PlayedArtifact) -> Player:
     compared, returns = played.compared, played.episodes.returns
     difference = Interval(compared.difference, compared.low, compared.high)
     mean = mean_interval(returns)
     return Player(played.where, mean, len(returns), compared.verdict, difference, played.sentence)
 
 
-def _entry(played: Played) -> dict[str, Any]:
+def _entry(played: PlayedArtifact) -> dict[str, Any]:
     c = played.compared
     return {
         "format": played.format,
@@ -185,7 +185,7 @@ def _summary(episodes: Episodes) -> dict[str, Any]:
     }
 
 
-def _names(played: tuple[Played, ...] | list[Played]) -> str:
+def _names(played: tuple[PlayedArtifact, ...] | list[PlayedArtifact]) -> str:
     return ", ".join(f"{p.format} in {p.runtime}" for p in played)
 
 

@@ -16,7 +16,7 @@ from export_model.signatures.digest import sha256_hex
 from export_model.signatures.errors import ExportModelError, SourceError
 
 #: Bytes of one source: the largest that is read is one of 2 GiB with its weights beside it.
-MAX_BYTES = 8 << 30
+MAX_REMOTE_BYTES = 8 << 30
 _CHUNK = 1 << 20
 _LONGEST_NAME = 200
 #: What tells one version of a file from the next, as file systems call it.
@@ -78,10 +78,10 @@ def _fetch(address: str, folder: Path) -> Path:
             where=path_text(address),
             fix="give the folder of one run, or a pattern that stands for files: **/*.onnx",
         )
-    left = MAX_BYTES - sum(info.get("size") or 0 for info in found.values())
+    left = MAX_REMOTE_BYTES - sum(info.get("size") or 0 for info in found.values())
     _within(left, address)
     left, top = (
-        MAX_BYTES,
+        MAX_REMOTE_BYTES,
         folder / _name(unquote(urlsplit(address).path) if is_http(address) else path_text(address), address),
     )
     with asking(address):  # which may say that a file has files in it, or lies elsewhere
@@ -119,7 +119,7 @@ def _download(system: Any, name: str, target: Path, left: int, address: str) -> 
 def _within(left: int, address: str) -> None:
     if left < 0:
         raise SourceError(
-            f"has more than {MAX_BYTES >> 30} GiB",
+            f"has more than {MAX_REMOTE_BYTES >> 30} GiB",
             where=path_text(address),
             fix="give the model alone, or download it first",
         )

@@ -13,7 +13,7 @@ _SWEEPS = 12
 _MARGIN = 22.0
 
 
-class Place(Struct):
+class BoxPlace(Struct):
     """A box, or (``item`` None) a point that a long edge passes: centre, width, row, places above it."""
 
     item: int | None
@@ -23,15 +23,15 @@ class Place(Struct):
     x: float = 0.0
 
 
-class Layout(Struct, frozen=True):
+class BoxLayout(Struct, frozen=True):
     """Places by index; ``edges`` are chains of places from a box down to a box. Sizes are pixels."""
 
-    places: list[Place]
+    places: list[BoxPlace]
     edges: list[list[int]]
     width: float
     rows: int
 
-    def y(self, place: Place) -> float:
+    def y(self, place: BoxPlace) -> float:
         """The centre of a row."""
         return _MARGIN + place.row * _ROW
 
@@ -41,16 +41,16 @@ class Layout(Struct, frozen=True):
         return 2 * _MARGIN + (self.rows - 1) * _ROW
 
 
-def layout(before: Sequence[set[int]], widths: Sequence[float]) -> Layout:
+def layout(before: Sequence[set[int]], widths: Sequence[float]) -> BoxLayout:
     """Place boxes, in topological order, under the boxes in their ``before``."""
     rows = _rows(before)
-    places = [Place(i, rows[i], widths[i], []) for i in range(len(before))]
+    places = [BoxPlace(i, rows[i], widths[i], []) for i in range(len(before))]
     edges = []
     for i, sources in enumerate(before):
         for source in sorted(sources):
             chain = [source]
             for row in range(rows[source] + 1, rows[i]):
-                places.append(Place(None, row, _PASSING, [chain[-1]]))
+                places.append(BoxPlace(None, row, _PASSING, [chain[-1]]))
                 chain.append(len(places) - 1)
             places[i].above.append(chain[-1])
             edges.append([*chain, i])
@@ -61,7 +61,7 @@ def layout(before: Sequence[set[int]], widths: Sequence[float]) -> Layout:
     by_row = [[i for i, p in enumerate(places) if p.row == r] for r in range(max(rows, default=-1) + 1)]
     _order(by_row, places, below)
     width = _across(by_row, places, below)
-    return Layout(places, edges, width, len(by_row))
+    return BoxLayout(places, edges, width, len(by_row))
 
 
 def _rows(before: Sequence[set[int]]) -> list[int]:
@@ -76,7 +76,7 @@ def _rows(before: Sequence[set[int]]) -> list[int]:
     return rows
 
 
-def _order(by_row: list[list[int]], places: list[Place], below: list[list[int]]) -> None:
+def _order(by_row: list[list[int]], places: list[BoxPlace], below: list[list[int]]) -> None:
     """Sort each row by the mean place of its neighbours, downwards and upwards in turn."""
     for sweep in range(_SWEEPS):
         down = sweep % 2 == 0
@@ -90,7 +90,7 @@ def _order(by_row: list[list[int]], places: list[Place], below: list[list[int]])
             rank.update({i: n for n, i in enumerate(row)})
 
 
-def _across(by_row: list[list[int]], places: list[Place], below: list[list[int]]) -> float:
+def _across(by_row: list[list[int]], places: list[BoxPlace], below: list[list[int]]) -> float:
     """Set every x near its neighbours' mean without overlaps; returns the width of the whole."""
     for row in by_row:
         x = 0.0
@@ -113,9 +113,9 @@ def _across(by_row: list[list[int]], places: list[Place], below: list[list[int]]
     return max((p.x + p.width / 2 for p in places), default=0.0) + 2
 
 
-def _spread(row: list[Place], wish: list[float]) -> None:
+def _spread(row: list[BoxPlace], wish: list[float]) -> None:
     """Move a row to its wishes, in order, ``_GAP`` apart: neighbours that would overlap share their error."""
-    groups: list[tuple[list[Place], float]] = []  # places side by side, and the centre that they want together
+    groups: list[tuple[list[BoxPlace], float]] = []  # places side by side, and the centre that they want together
     for place, x in zip(row, wish, strict=True):
         group, centre = [place], x
         while groups and groups[-1][1] + _extent(groups[-1][0]) / 2 + _GAP > centre - _extent(group) / 2:
@@ -130,5 +130,5 @@ def _spread(row: list[Place], wish: list[float]) -> None:
             x += place.width + _GAP
 
 
-def _extent(group: list[Place]) -> float:
+def _extent(group: list[BoxPlace]) -> float:
     return sum(p.width for p in group) + _GAP * (len(group) - 1)

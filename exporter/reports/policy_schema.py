@@ -11,7 +11,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from export_model.signatures.contract import SCHEMA, Code, Distribution, Head, Origin, Preprocess, Tool
+from export_model.signatures.contract import SCHEMA, CodeSection, ContractHead, Distribution, Origin, Preprocess, Tool
 from export_model.signatures.fields import Text
 from export_model.signatures.labels import Labels
 from export_model.signatures.spec import PolicySignature
@@ -24,7 +24,7 @@ _READ_APART = {
     ("TensorSpec", "distribution"): Distribution,
 }
 #: Those of which all may be missing that msgspec does not require.
-_OPTIONS = {kind.__name__ for kind in (Code, Labels, Tool)}
+_OPTIONS = {kind.__name__ for kind in (CodeSection, Labels, Tool)}
 #: Of a docstring's list.
 _ITEM = re.compile(r"^- (``\w+``(?:, ``\w+``)*): (.+?)(?=^- |\Z)", re.DOTALL | re.MULTILINE)
 #: What is for messages, or says no more than the type.
@@ -39,14 +39,14 @@ def policy_schema() -> dict[str, Any]:
     """
     from msgspec.json import schema_components
 
-    kinds = [PolicySignature, Head, *_READ_APART.values()]
+    kinds = [PolicySignature, ContractHead, *_READ_APART.values()]
     found, parts = schema_components(kinds, ref_template="#/$defs/{name}")
     for (record, member), node in zip(_READ_APART, found[2:], strict=True):
         members = parts[record]["properties"]
         members[member] = {**node, **{k: v for k, v in members[member].items() if k == "default"}}
     parts = {name: _describe(name, part) for name, part in parts.items()}
     parts[Origin.__name__]["additionalProperties"] = True
-    head, signature = (parts.pop(kind.__name__) for kind in (Head, PolicySignature))
+    head, signature = (parts.pop(kind.__name__) for kind in (ContractHead, PolicySignature))
     own = head["properties"]
     own["files"]["minProperties"] = signature["properties"]["outputs"]["minItems"] = 1  # what else is read is refused
     members = {

@@ -21,7 +21,7 @@ _EXPORTED = re.compile(r"^export (?=class|function|const)", re.M)
 _DEFAULT = re.compile(r"^export default .*;\n", re.M)
 
 
-class Engine(Struct, frozen=True):
+class PageEngine(Struct, frozen=True):
     """``module`` exports ``make``, which returns ``{ Agent, ports, load, matrices }``; ``load`` takes ``weights``.
 
     ``matrices()`` gives [array, columns] of each weight that training began with a draw for.
@@ -31,7 +31,7 @@ class Engine(Struct, frozen=True):
     weights: bytes
 
 
-def engine_of(bundle: Bundle, graph: Graph) -> Engine:
+def engine_of(bundle: Bundle, graph: Graph) -> PageEngine:
     """Return the engine of a bundle whose graph the numpy kernels run. Raises UnsupportedOpError."""
     signature = bundle.signature
     feeds, fetches = ({s.name: s.name for s in specs} for specs in (signature.inputs, signature.outputs))
@@ -44,7 +44,7 @@ def engine_of(bundle: Bundle, graph: Graph) -> Engine:
         f"[{name}, {shape[-1]}]" for name, shape in written.weights.items() if len(shape) > 1 and min(shape[-2:]) > 1
     )
     made = f"{{ Agent: {written.class_name}, ports, load, matrices: () => [{matrices}] }}"
-    return Engine(f"export const make = () => {{\n{body}return {made};\n}};\n".encode(), written.file)
+    return PageEngine(f"export const make = () => {{\n{body}return {made};\n}};\n".encode(), written.file)
 
 
 def makers_module(names: Mapping[str, str]) -> bytes:

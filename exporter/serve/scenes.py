@@ -14,7 +14,7 @@ from export_model.signatures.spec import PolicySignature
 AUTO, NONE = "auto", "none"
 
 
-class Scene(Struct, frozen=True):
+class PageScene(Struct, frozen=True):
     """``page/scenes/<id>.mjs``. ``side`` is the part of a scene that two policies play in."""
 
     id: str
@@ -48,19 +48,19 @@ class Scene(Struct, frozen=True):
 
 
 SCENES = (
-    Scene("ball3d", "3DBall", 8, continuous=2),
-    Scene("gridworld", "GridWorld", 6, branches=(4,)),
-    Scene("hallway", "Hallway", 4, branches=(3,), memory=True),
-    Scene("tennis", "Tennis", 5, branches=(3,), side="left"),
-    Scene("tennis", "Tennis", 5, continuous=1, side="right"),
-    Scene("crawler2d", "Crawler2D", 26, continuous=8),
+    PageScene("ball3d", "3DBall", 8, continuous=2),
+    PageScene("gridworld", "GridWorld", 6, branches=(4,)),
+    PageScene("hallway", "Hallway", 4, branches=(3,), memory=True),
+    PageScene("tennis", "Tennis", 5, branches=(3,), side="left"),
+    PageScene("tennis", "Tennis", 5, continuous=1, side="right"),
+    PageScene("crawler2d", "Crawler2D", 26, continuous=8),
 )
 """The environments of exporter/play/environments: after examples of ML-Agents, but for Crawler2D. That is the name and
 shape of no example, so that a policy of ML-Agents' Crawler, which another physics made, does not end here.
 """
 
 
-def scene_of(name: str, signature: PolicySignature, asked: str = AUTO) -> Scene | None:
+def scene_of(name: str, signature: PolicySignature, asked: str = AUTO) -> PageScene | None:
     """The scene for a policy called ``name``; None: there is none. Raises UsageError where ``asked`` does not fit."""
     if asked == NONE:
         return None

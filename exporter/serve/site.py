@@ -19,7 +19,7 @@ from export_model.converters.formats.registry import FROZEN_GRAPH, ONNX, TFJS, W
 from export_model.converters.runtimes.javascript.node import INSTALL_TFJS, check_packages, js_home, package_version
 from export_model.exporter import __version__
 from export_model.exporter.serve.engine import engine_of, makers_module
-from export_model.exporter.serve.scenes import AUTO, Scene, other_side, scene_of
+from export_model.exporter.serve.scenes import AUTO, PageScene, other_side, scene_of
 from export_model.exporter.serve.selftest import golden
 from export_model.exporter.serve.server import DATA, INDEX, TYPES
 from export_model.signatures.contract import PARITY, POLICY, json_of
@@ -324,7 +324,7 @@ def _model(found: Bundle, place: str) -> dict[str, bytes]:
     return {f"{place}/{name.removeprefix(folder)}": (found.folder / name).read_bytes() for name in sorted(names)}
 
 
-def _opponent(first: Bundle, scene: Scene) -> Bundle | None:
+def _opponent(first: Bundle, scene: PageScene) -> Bundle | None:
     """The other player's bundle, where it lies beside this one; the page says so where it does not."""
     for other in other_side(first.name):
         beside = first.folder.resolve().parent / other

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 from export_model.converters.consumers.mlagents.memory import DRAWN_KEPT
 from export_model.exporter.snippets.contract import (
-    Bundle,
+    SnippetBundle,
     branch_lines,
     class_name,
     fill_template,
@@ -23,7 +23,7 @@ from export_model.signatures.roles import SENSOR_ORDER, Role
 from export_model.signatures.spec import TensorSpec
 
 
-def agent(bundle: Bundle) -> str:
+def agent(bundle: SnippetBundle) -> str:
     """The class, and the settings as a comment above it."""
     sensors = ordered_sensors(bundle)
     vector = vector_sensor(sensors)
@@ -50,7 +50,7 @@ def script_name(name: str) -> str:
     return f"Agent{word.removeprefix('Policy')}" if word.startswith("Policy") else f"{word.removesuffix('Policy')}Agent"
 
 
-def ordered_sensors(bundle: Bundle) -> list[TensorSpec]:
+def ordered_sensors(bundle: SnippetBundle) -> list[TensorSpec]:
     """The observations in the order in which Unity feeds them."""
     specs = list(bundle.signature.observations)
     numbers = {s.name: int(s.name.removeprefix("obs_")) for s in specs if re.fullmatch("obs_[0-9]+", s.name)}
@@ -64,7 +64,7 @@ def vector_sensor(sensors: Sequence[TensorSpec]) -> TensorSpec | None:
     return next((s for s in reversed(sensors) if s.role is Role.VECTOR and len(s.shape) < 3), None)
 
 
-def _head(bundle: Bundle, sensors: list[TensorSpec], vector: TensorSpec | None) -> list[str]:
+def _head(bundle: SnippetBundle, sensors: list[TensorSpec], vector: TensorSpec | None) -> list[str]:
     signature = bundle.signature
     size = 0 if vector is None else vector.shape[-1]
     sizes = ", ".join(map(str, signature.branches))
@@ -88,7 +88,7 @@ def _head(bundle: Bundle, sensors: list[TensorSpec], vector: TensorSpec | None) 
     return [f"// {line}" for line in lines]
 
 
-def _model(bundle: Bundle) -> str:
+def _model(bundle: SnippetBundle) -> str:
     if bundle.made_for is not None:
         from export_model.converters.consumers.profiles import profile
 
@@ -100,7 +100,7 @@ def _model(bundle: Bundle) -> str:
     return f"{bundle.name}.onnx of a bundle made with --for unity6 (export-model --for help: for older ones)"
 
 
-def component_text(bundle: Bundle, spec: TensorSpec) -> str:
+def component_text(bundle: SnippetBundle, spec: TensorSpec) -> str:
     """Which sensor component shows an observation."""
     lengths = [n or 0 for n in spec.shape[1:]]
     if spec.role is Role.VISUAL and len(lengths) == 3:
@@ -113,18 +113,18 @@ def component_text(bundle: Bundle, spec: TensorSpec) -> str:
     return f"{spec.name}: a sensor of {'x'.join(map(str, lengths))} numbers (rays, a grid, as it was trained)"
 
 
-def _observations(bundle: Bundle, spec: TensorSpec) -> str:
+def _observations(bundle: SnippetBundle, spec: TensorSpec) -> str:
     names = bundle.signature.labels.get("observations", {}).get(spec.name, [])
     size = spec.shape[-1] or 0
     lines = wrap_items(f"{size} numbers, in the order of training", number_names(names))
     return fill_template("agent_observations.cs", comments=_inside([f"// {line}" for line in lines]), size=str(size))
 
 
-def _continuous(bundle: Bundle) -> int:
+def _continuous(bundle: SnippetBundle) -> int:
     return next((head.shape[-1] or 0 for head in bundle.heads if head.role is Role.CONTINUOUS), 0)
 
 
-def _actions(bundle: Bundle) -> tuple[list[str], list[str]]:
+def _actions(bundle: SnippetBundle) -> tuple[list[str], list[str]]:
     """What is done with received actions, and how a player's own are given."""
     count = _continuous(bundle)
     received, own = [], []

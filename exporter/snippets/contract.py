@@ -43,7 +43,7 @@ STEPS = 3
 WIDTH = 100
 
 
-class Bundle(Struct, frozen=True):
+class SnippetBundle(Struct, frozen=True):
     """A bundle as the snippets need it; ``folder`` is written into the code as it was given."""
 
     folder: Path
@@ -139,7 +139,7 @@ class Bundle(Struct, frozen=True):
         return self.signature.companion_of(head.name) or head
 
 
-def read_bundle(folder: Path) -> Bundle:
+def read_bundle(folder: Path) -> SnippetBundle:
     """A bundle by its policy.json. Raises BundleError, also where its .bytes is not the one that was written."""
     found, frozen = bundle.Bundle.open(folder), FROZEN_GRAPH
     nodes: frozenset[str] = frozenset()
@@ -148,7 +148,7 @@ def read_bundle(folder: Path) -> Bundle:
         with naming(found.path(frozen)):
             nodes = frozenset(node.name for node in read_graph(found.path(frozen).read_bytes()).nodes)
     made_for = found.contract.tool.get("profile")
-    return Bundle(folder, found.name, _as_fed(found.contract), frozenset(found.contract.files), nodes, made_for)
+    return SnippetBundle(folder, found.name, _as_fed(found.contract), frozenset(found.contract.files), nodes, made_for)
 
 
 def _as_fed(contract: Contract) -> PolicySignature:
@@ -170,7 +170,7 @@ def example_size(spec: TensorSpec) -> int:
     return math.prod(example_shape(spec))
 
 
-def meaning(bundle: Bundle, spec: TensorSpec) -> list[str]:
+def meaning(bundle: SnippetBundle, spec: TensorSpec) -> list[str]:
     """Comment lines on an input: what it takes, and what its numbers are called."""
     signature = bundle.signature
     text = _FEED.get(spec.role, spec.role.value)
@@ -187,7 +187,7 @@ def meaning(bundle: Bundle, spec: TensorSpec) -> list[str]:
     return [*wrap_items(f"{spec.name}: {text}", number_names(names)), *_interface_lines(signature, spec.name)]
 
 
-def action_meaning(bundle: Bundle, head: TensorSpec) -> list[str]:
+def action_meaning(bundle: SnippetBundle, head: TensorSpec) -> list[str]:
     """Comment lines on an action."""
     if head.is_continuous:
         names = number_names(bundle.signature.labels.get("actions", []))
@@ -205,7 +205,7 @@ def _interface_lines(signature: PolicySignature, name: str) -> list[str]:
     return [part for line in lines for part in textwrap.wrap(line, WIDTH, subsequent_indent="  ")]
 
 
-def branch_lines(bundle: Bundle) -> list[str]:
+def branch_lines(bundle: SnippetBundle) -> list[str]:
     """A comment line per branch of discrete actions."""
     labels = bundle.signature.labels.get("branches", [])
     lines: list[str] = []

@@ -6,7 +6,7 @@ from export_model.converters.formats.programs.members import header_of
 from export_model.exporter.snippets.contract import (
     ODDS,
     STEPS,
-    Bundle,
+    SnippetBundle,
     action_meaning,
     class_name,
     example_shape,
@@ -38,7 +38,7 @@ _TYPES = {
 # ------------------------------------------------------------------ TensorFlowSharp
 
 
-def tensorflowsharp(bundle: Bundle) -> str:
+def tensorflowsharp(bundle: SnippetBundle) -> str:
     """TFGraph and TFSession."""
     before, lines = bundle.beginnings("var {} = {};  // {}", _array), ["var runner = session.GetRunner();"]
     memory, previous = bundle.memory, bundle.previous
@@ -82,7 +82,7 @@ def tensorflowsharp(bundle: Bundle) -> str:
     )
 
 
-def _draws(bundle: Bundle, name: str, odds: TensorSpec, value: str) -> list[str]:
+def _draws(bundle: SnippetBundle, name: str, odds: TensorSpec, value: str) -> list[str]:
     """Lines that draw a class of each branch, of log-probabilities or probabilities."""
     sizes, score = ", ".join(map(str, bundle.signature.branches)), "odds[agent, start + i]"
     plain = bundle.plain(odds)
@@ -130,7 +130,7 @@ def _array(spec: TensorSpec) -> str:
 # ------------------------------------------------------------------ Inference Engine
 
 
-def inference_engine(bundle: Bundle) -> str:
+def inference_engine(bundle: SnippetBundle) -> str:
     """ModelLoader and Worker. The engine has float and int tensors; int64 becomes int."""
     previous, kept = bundle.previous, bundle.kept_variables
     fields = [
@@ -194,7 +194,7 @@ def _read(spec: TensorSpec, variable: str) -> str:
 # ------------------------------------------------------------------ source code
 
 
-def source_agent(bundle: Bundle) -> str:
+def source_agent(bundle: SnippetBundle) -> str:
     """Return an ML-Agents Agent whose Heuristic is the policy's C# class: no Model, no package but ML-Agents."""
     signature = bundle.signature
     header = header_of(bundle.name, signature)

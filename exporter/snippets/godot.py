@@ -5,10 +5,10 @@ Source: controller/ai_controller_3d.gd and sync.gd of the plugin: ``get_obs``, `
 
 from __future__ import annotations
 
-from export_model.exporter.snippets.contract import Bundle, fill_template
+from export_model.exporter.snippets.contract import SnippetBundle, fill_template
 
 
-def godot(bundle: Bundle) -> str:
+def godot(bundle: SnippetBundle) -> str:
     """The controller, in GDScript; a line that says how to get the file where it was made for another consumer."""
     if bundle.made_for != "godot-rl":
         return f"# {bundle.name}.onnx has other names than the plugin loads: export-model SOURCE --for godot-rl\n"

@@ -13,7 +13,7 @@ from enum import StrEnum
 from export_model.exporter.snippets.contract import (
     ODDS,
     STEPS,
-    Bundle,
+    SnippetBundle,
     action_meaning,
     example_shape,
     example_size,
@@ -42,7 +42,7 @@ _ARRAYS = {
 }
 
 
-class Place(StrEnum):
+class CodePlace(StrEnum):
     """Where the code runs, and where its runtime comes from."""
 
     PAGE = "page"
@@ -50,49 +50,49 @@ class Place(StrEnum):
     NODE = "node"
 
 
-def acting_tfjs(bundle: Bundle, place: Place = Place.PAGE) -> str:
+def acting_tfjs(bundle: SnippetBundle, place: CodePlace = CodePlace.PAGE) -> str:
     """policy.mjs with TensorFlow.js."""
     return _program(bundle, TFJS, "acting_tfjs.mjs", "tfjs/model.json", _agents(bundle), place)
 
 
-def acting_ort(bundle: Bundle, place: Place = Place.PAGE) -> str:
+def acting_ort(bundle: SnippetBundle, place: CodePlace = CodePlace.PAGE) -> str:
     """policy.mjs with onnxruntime-web."""
     return _program(bundle, ORT, "acting_ort.mjs", f"{bundle.name}.onnx", _agents(bundle), place)
 
 
-def plain_tfjs(bundle: Bundle, place: Place = Place.PAGE) -> str:
+def plain_tfjs(bundle: SnippetBundle, place: CodePlace = CodePlace.PAGE) -> str:
     """``tf.loadGraphModel`` alone."""
     run = "const outputs = model.predict(feeds);  // tensors by name; dispose of them in a long run: tf.dispose"
     play = _plain(bundle, _tf_value, run, "await outputs[{}].array()")
-    if place is Place.NODE:  # there is no loader for files in the package
+    if place is CodePlace.NODE:  # there is no loader for files in the package
         return _program(bundle, TFJS, "plain_tfjs_node.mjs", "tfjs/", play, place)
     return _program(bundle, TFJS, "plain_tfjs.mjs", "tfjs/model.json", play, place)
 
 
-def plain_ort(bundle: Bundle, place: Place = Place.PAGE) -> str:
+def plain_ort(bundle: SnippetBundle, place: CodePlace = CodePlace.PAGE) -> str:
     """onnxruntime-web alone."""
     run = "const outputs = await session.run(feeds);"
     play = _plain(bundle, _ort_value, run, "Array.from(outputs[{}].data, Number)")
-    frame = "plain_ort_node.mjs" if place is Place.NODE else "plain_ort.mjs"
+    frame = "plain_ort_node.mjs" if place is CodePlace.NODE else "plain_ort.mjs"
     return _program(bundle, ORT, frame, f"{bundle.name}.onnx", play, place)
 
 
-def _program(bundle: Bundle, runtime: Package, frame: str, model: str, play: str, place: Place) -> str:
+def _program(bundle: SnippetBundle, runtime: Package, frame: str, model: str, play: str, place: CodePlace) -> str:
     code = fill_template(frame, module=_url(bundle, "tfjs/policy.mjs"), model=_url(bundle, model), play=play).rstrip()
     install = f"npm install {runtime.name}@{runtime.version}"
-    if place is Place.NODE:
+    if place is CodePlace.NODE:
         return fill_template("node.mjs", name=bundle.name, how=install, code=code)
     server = "python3 -m http.server"
-    how = server if place is Place.CDN else f"{install}; {server}"
-    imports = runtime.import_map(cdn=place is Place.CDN)
+    how = server if place is CodePlace.CDN else f"{install}; {server}"
+    imports = runtime.import_map(cdn=place is CodePlace.CDN)
     return fill_template("page.html", name=bundle.name, how=how, imports=imports, code=code)
 
 
-def _url(bundle: Bundle, relative: str) -> str:
+def _url(bundle: SnippetBundle, relative: str) -> str:
     return string_literal(f"./{bundle.name}/{relative}")
 
 
-def _agents(bundle: Bundle) -> str:
+def _agents(bundle: SnippetBundle) -> str:
     lines = ["const decision = await agents.decide({"]
     for spec in bundle.signature.observations:
         lines += _entry(bundle, spec, _flat(spec))
@@ -115,7 +115,7 @@ def _agents(bundle: Bundle) -> str:
     return "\n".join([*start, *_loop_lines(bundle, lines)])
 
 
-def _plain(bundle: Bundle, value: Callable[[TensorSpec], str], run: str, read: str) -> str:
+def _plain(bundle: SnippetBundle, value: Callable[[TensorSpec], str], run: str, read: str) -> str:
     """The lines from feeds to actions, with what goes from step to step; ``read`` takes an output."""
     lines = ["const feeds = {"]
     for spec in bundle.signature.inputs:
@@ -135,7 +135,7 @@ def _plain(bundle: Bundle, value: Callable[[TensorSpec], str], run: str, read: s
     return "\n".join([*before, *_loop_lines(bundle, lines)])
 
 
-def _other(bundle: Bundle, head: TensorSpec) -> str:
+def _other(bundle: SnippetBundle, head: TensorSpec) -> str:
     """The comment that names the action without chance, or with it, that a line does not take."""
     plain = bundle.plain(head)
     if plain == head:
@@ -144,7 +144,7 @@ def _other(bundle: Bundle, head: TensorSpec) -> str:
     return f"  // {what}: outputs[{string_literal(other.name)}]"
 
 
-def _draw(bundle: Bundle) -> list[str]:
+def _draw(bundle: SnippetBundle) -> list[str]:
     """The function that draws a class of each branch, where an action is odds."""
     roles = [head.role for head in bundle.heads if head.role in ODDS]
     if not roles:
@@ -170,18 +170,18 @@ def _again(spec: TensorSpec, taken: str, *, tensorflow: bool) -> str:
     return f"previous = new ort.Tensor({string_literal(spec.dtype)}, {_ARRAYS[spec.dtype]}.from({values}), {shape});"
 
 
-def _loop_lines(bundle: Bundle, lines: list[str]) -> list[str]:
+def _loop_lines(bundle: SnippetBundle, lines: list[str]) -> list[str]:
     if not bundle.remembers:
         return lines
     return [f"for (let step = 0; step < {STEPS}; step++) {{", *(f"  {line}" for line in lines), "}"]
 
 
-def _entry(bundle: Bundle, spec: TensorSpec, value: str) -> list[str]:
+def _entry(bundle: SnippetBundle, spec: TensorSpec, value: str) -> list[str]:
     key = spec.name if re.fullmatch("[A-Za-z_][A-Za-z0-9_]*", spec.name) else string_literal(spec.name)
     return [*_comment(bundle, spec), f"  {key}: {value},"]
 
 
-def _comment(bundle: Bundle, spec: TensorSpec) -> list[str]:
+def _comment(bundle: SnippetBundle, spec: TensorSpec) -> list[str]:
     return [f"  // {_safe(line)}" for line in meaning(bundle, spec)]
 
 

@@ -6,7 +6,7 @@ from export_model.converters.formats.registry import ONNX, SAVED_MODEL
 from export_model.exporter.snippets.contract import (
     ODDS,
     STEPS,
-    Bundle,
+    SnippetBundle,
     action_meaning,
     example_shape,
     fill_template,
@@ -17,7 +17,7 @@ from export_model.signatures.roles import Role
 from export_model.signatures.spec import TensorSpec
 
 
-def onnxruntime(bundle: Bundle) -> str:
+def onnxruntime(bundle: SnippetBundle) -> str:
     """The ONNX in onnxruntime."""
     run = "dict(zip(names, session.run(names, feeds)))"
     return fill_template(
@@ -27,7 +27,7 @@ def onnxruntime(bundle: Bundle) -> str:
     )
 
 
-def saved_model(bundle: Bundle) -> str:
+def saved_model(bundle: SnippetBundle) -> str:
     """The SavedModel in TensorFlow."""
     run = [
         "answer = policy(**{name: tf.constant(value) for name, value in feeds.items()})",
@@ -38,7 +38,7 @@ def saved_model(bundle: Bundle) -> str:
     )
 
 
-def load_policy(bundle: Bundle) -> str:
+def load_policy(bundle: SnippetBundle) -> str:
     """The bundle by this tool's own package."""
     masks = next((s for s in bundle.signature.inputs if s.role is Role.MASKS), None)
     parameters = [s for s in bundle.signature.inputs if s.role is Role.PARAMETER]
@@ -61,7 +61,7 @@ def load_policy(bundle: Bundle) -> str:
     return fill_template("load_policy.py", path=string_literal(bundle.folder.as_posix()), play=loop_text(bundle, lines))
 
 
-def play(bundle: Bundle, run: list[str]) -> str:
+def play(bundle: SnippetBundle, run: list[str]) -> str:
     """From feeds to actions by ``run``, which makes ``outputs`` (name → array) of ``feeds``."""
     before = ["rng = np.random.default_rng()"] if _draws(bundle) else []
     before += bundle.beginnings("{} = {}  # {}", array)
@@ -80,7 +80,7 @@ def play(bundle: Bundle, run: list[str]) -> str:
     return "\n".join([*before, loop_text(bundle, lines)])
 
 
-def loop_text(bundle: Bundle, lines: list[str]) -> str:
+def loop_text(bundle: SnippetBundle, lines: list[str]) -> str:
     """``lines`` as they are, or in a loop of a few steps where the policy remembers."""
     if not bundle.remembers:
         return "\n".join([*lines, ""])
@@ -93,21 +93,21 @@ def array(spec: TensorSpec) -> str:
     return f"np.{maker}({_shape(example_shape(spec))}, {_dtype(spec)})"
 
 
-def _entry(bundle: Bundle, spec: TensorSpec, value: str) -> list[str]:
+def _entry(bundle: SnippetBundle, spec: TensorSpec, value: str) -> list[str]:
     return [*(f"    # {text}" for text in meaning(bundle, spec)), f"    {string_literal(spec.name)}: {value},"]
 
 
-def _feed_expression(bundle: Bundle, spec: TensorSpec) -> str:
+def _feed_expression(bundle: SnippetBundle, spec: TensorSpec) -> str:
     if spec.role is Role.NOISE:
         return f"rng.standard_normal({_shape(example_shape(spec))}, {_dtype(spec)})"
     return bundle.kept_variables.get(spec.name) or array(spec)
 
 
-def _draws(bundle: Bundle) -> bool:
+def _draws(bundle: SnippetBundle) -> bool:
     return bool(bundle.signature.noise) or any(h.role in ODDS for h in bundle.heads)
 
 
-def _action(bundle: Bundle, variable: str, head: TensorSpec) -> list[str]:
+def _action(bundle: SnippetBundle, variable: str, head: TensorSpec) -> list[str]:
     plain = bundle.plain(head)
     lines = [f"# {text}" for text in action_meaning(bundle, head)]
     if plain != head:

@@ -10,18 +10,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from export_model.exporter.snippets.agent import component_text, ordered_sensors, script_name, vector_sensor
-from export_model.exporter.snippets.contract import Bundle, fill_template, string_literal
+from export_model.exporter.snippets.contract import SnippetBundle, fill_template, string_literal
 from export_model.signatures.roles import Role
 from export_model.signatures.spec import TensorSpec
 
 
-def gymnasium(bundle: Bundle) -> str:
+def gymnasium(bundle: SnippetBundle) -> str:
     """A wrapper of the environment."""
     masks = next((string_literal(s.name) for s in bundle.signature.inputs if s.role is Role.MASKS), "None")
     return fill_template("recorder_gymnasium.py", **_names(bundle), masks=masks, head=_head(bundle, "#", "run.npz"))
 
 
-def ros2(bundle: Bundle) -> str:
+def ros2(bundle: SnippetBundle) -> str:
     """A node that listens to the controller's topics."""
     kinds = ["Float32MultiArray" if h.is_continuous else "Int32MultiArray" for h in bundle.signature.heads]
     entries = [f"{string_literal(h.name)}: {kind}" for h, kind in zip(bundle.heads, kinds, strict=True)]
@@ -33,12 +33,12 @@ def ros2(bundle: Bundle) -> str:
     )
 
 
-def isaac_lab(bundle: Bundle) -> str:
+def isaac_lab(bundle: SnippetBundle) -> str:
     """What the loop of a play script calls."""
     return fill_template("recorder_isaac_lab.py", **_names(bundle), head=_head(bundle, "#", "run.npz"))
 
 
-def unity(bundle: Bundle) -> str:
+def unity(bundle: SnippetBundle) -> str:
     """A component beside the agent."""
     sensors = ordered_sensors(bundle)
     vector = vector_sensor(sensors)
@@ -74,7 +74,7 @@ def _forbid(sizes: Sequence[int]) -> str:
     )
 
 
-def _names(bundle: Bundle) -> dict[str, str]:
+def _names(bundle: SnippetBundle) -> dict[str, str]:
     return {"observations": _tuple(bundle.signature.observations), "actions": _tuple(bundle.heads)}
 
 
@@ -82,7 +82,7 @@ def _tuple(specs: Sequence[TensorSpec]) -> str:
     return f"({''.join(f'{string_literal(s.name)}, ' for s in specs).rstrip(' ' if len(specs) == 1 else ', ')})"
 
 
-def _head(bundle: Bundle, mark: str, file: str) -> str:
+def _head(bundle: SnippetBundle, mark: str, file: str) -> str:
     command = f"export-model verify {bundle.folder.as_posix()!r} --log {file}"
     text = "".join(c if c.isprintable() else "?" for c in command)
     return f"{mark} Records what the policy is given and answers. Then: {text}"

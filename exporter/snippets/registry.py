@@ -12,11 +12,11 @@ from msgspec import Struct
 from export_model.converters.formats.format import Code, Format
 from export_model.converters.formats.registry import BARRACUDA, CSHARP, FROZEN_GRAPH, ONNX, SAVED_MODEL, TFJS, WRITTEN
 from export_model.exporter.snippets import agent, csharp, godot, javascript, python, recorders, serving, unity
-from export_model.exporter.snippets.contract import Bundle, string_literal
+from export_model.exporter.snippets.contract import SnippetBundle, string_literal
 from export_model.signatures.errors import BundleError, UsageError
 
 
-class Target(Struct, frozen=True):
+class Caller(Struct, frozen=True):
     """One way to call a policy.
 
     ``name`` is the one for ``--for``; ``needs`` are the formats: any of them, or of several that it needs together.
@@ -26,7 +26,7 @@ class Target(Struct, frozen=True):
     title: str
     language: str
     needs: tuple[Format | tuple[Format, ...], ...]
-    render: Callable[[Bundle], str]
+    render: Callable[[SnippetBundle], str]
 
     @property
     def alternatives(self) -> list[list[str]]:
@@ -47,47 +47,49 @@ def _javascript(
     name: str,
     title: str,
     need: Format | tuple[Format, ...],
-    render: Callable[[Bundle, javascript.Place], str],
+    render: Callable[[SnippetBundle, javascript.CodePlace], str],
     *,
     node: str = "",
-) -> Iterator[Target]:
+) -> Iterator[Caller]:
     """A page with its runtime beside it, the same with it from a CDN, and a program for Node."""
     places = (
-        (name, "A page", "html", javascript.Place.PAGE),
-        (f"{name}-cdn", "A page, runtime from a CDN", "html", javascript.Place.CDN),
-        (node or f"{name}-node", "Node", "js", javascript.Place.NODE),
+        (name, "A page", "html", javascript.CodePlace.PAGE),
+        (f"{name}-cdn", "A page, runtime from a CDN", "html", javascript.CodePlace.CDN),
+        (node or f"{name}-node", "Node", "js", javascript.CodePlace.NODE),
     )
     for called, where, language, place in places:
-        yield Target(called, f"{where}, {title}", language, (need,), partial(_render_at, render, place))
+        yield Caller(called, f"{where}, {title}", language, (need,), partial(_render_at, render, place))
 
 
-def _render_at(render: Callable[[Bundle, javascript.Place], str], place: javascript.Place, bundle: Bundle) -> str:
+def _render_at(
+    render: Callable[[SnippetBundle, javascript.CodePlace], str], place: javascript.CodePlace, bundle: SnippetBundle
+) -> str:
     return render(bundle, place)
 
 
-TARGETS: tuple[Target, ...] = (
-    Target("load-policy", "Python, export_model", "python", (ONNX, FROZEN_GRAPH), python.load_policy),
-    Target("onnxruntime", "Python, onnxruntime", "python", (ONNX,), python.onnxruntime),
-    Target("saved-model", "Python, tf.saved_model.load", "python", (SAVED_MODEL,), python.saved_model),
-    Target("serving-docker", "TensorFlow Serving, the container", "sh", (SAVED_MODEL,), serving.docker),
-    Target("serving-rest", "TensorFlow Serving, REST with curl", "sh", (SAVED_MODEL,), serving.rest),
-    Target("serving-grpc", "TensorFlow Serving, gRPC from Python", "python", (SAVED_MODEL,), serving.grpc),
+TARGETS: tuple[Caller, ...] = (
+    Caller("load-policy", "Python, export_model", "python", (ONNX, FROZEN_GRAPH), python.load_policy),
+    Caller("onnxruntime", "Python, onnxruntime", "python", (ONNX,), python.onnxruntime),
+    Caller("saved-model", "Python, tf.saved_model.load", "python", (SAVED_MODEL,), python.saved_model),
+    Caller("serving-docker", "TensorFlow Serving, the container", "sh", (SAVED_MODEL,), serving.docker),
+    Caller("serving-rest", "TensorFlow Serving, REST with curl", "sh", (SAVED_MODEL,), serving.rest),
+    Caller("serving-grpc", "TensorFlow Serving, gRPC from Python", "python", (SAVED_MODEL,), serving.grpc),
     *_javascript("policy-tfjs", "policy.mjs with TensorFlow.js", TFJS, javascript.acting_tfjs, node="policy-node"),
     *_javascript("policy-ort", "policy.mjs with onnxruntime-web", (TFJS, ONNX), javascript.acting_ort),
     *_javascript("tfjs", "tf.loadGraphModel", TFJS, javascript.plain_tfjs),
     *_javascript("onnxruntime-web", "onnxruntime-web", ONNX, javascript.plain_ort),
-    Target("tensorflowsharp", "C#, TensorFlowSharp", "csharp", (FROZEN_GRAPH,), csharp.tensorflowsharp),
-    Target(
+    Caller("tensorflowsharp", "C#, TensorFlowSharp", "csharp", (FROZEN_GRAPH,), csharp.tensorflowsharp),
+    Caller(
         "internal-brain", "Unity, Internal Brain (ML-Agents 0.1 to 0.6)", "text", (FROZEN_GRAPH,), unity.internal_brain
     ),
-    Target("inference-engine", "Unity Inference Engine (Sentis), C#", "csharp", (ONNX,), csharp.inference_engine),
-    Target("godot", "Godot RL Agents, an AIController, GDScript", "gdscript", (ONNX,), godot.godot),
-    Target("agent", "Unity, an ML-Agents Agent, C#", "csharp", (ONNX, BARRACUDA), agent.agent),
-    Target("source-agent", "Unity without a runtime, an Agent's Heuristic", "csharp", (CSHARP,), csharp.source_agent),
+    Caller("inference-engine", "Unity Inference Engine (Sentis), C#", "csharp", (ONNX,), csharp.inference_engine),
+    Caller("godot", "Godot RL Agents, an AIController, GDScript", "gdscript", (ONNX,), godot.godot),
+    Caller("agent", "Unity, an ML-Agents Agent, C#", "csharp", (ONNX, BARRACUDA), agent.agent),
+    Caller("source-agent", "Unity without a runtime, an Agent's Heuristic", "csharp", (CSHARP,), csharp.source_agent),
 )
 
 
-def _fill_code(found: Format, code: Code, bundle: Bundle) -> str:
+def _fill_code(found: Format, code: Code, bundle: SnippetBundle) -> str:
     return Template(code.text).substitute(path=string_literal(bundle.path(found.main_of(bundle.name))))
 
 
@@ -104,15 +106,15 @@ _CALLED = {
 #: What writes a log needs no file of the policy.
 _ANY = tuple(WRITTEN.values())
 TARGETS += (
-    Target("recorder-unity", "A log from Unity, beside an ML-Agents Agent, C#", "csharp", _ANY, recorders.unity),
-    Target("recorder-gymnasium", "A log from Gymnasium, Python", "python", _ANY, recorders.gymnasium),
-    Target("recorder-ros2", "A log from ROS 2, Python", "python", _ANY, recorders.ros2),
-    Target("recorder-isaac-lab", "A log from Isaac Lab, Python", "python", _ANY, recorders.isaac_lab),
+    Caller("recorder-unity", "A log from Unity, beside an ML-Agents Agent, C#", "csharp", _ANY, recorders.unity),
+    Caller("recorder-gymnasium", "A log from Gymnasium, Python", "python", _ANY, recorders.gymnasium),
+    Caller("recorder-ros2", "A log from ROS 2, Python", "python", _ANY, recorders.ros2),
+    Caller("recorder-isaac-lab", "A log from Isaac Lab, Python", "python", _ANY, recorders.isaac_lab),
 )
 
 # The snippets that formats bring themselves.
 TARGETS += tuple(
-    Target(code.name, code.title, code.language, (found,), partial(_fill_code, found, code))
+    Caller(code.name, code.title, code.language, (found,), partial(_fill_code, found, code))
     for found in WRITTEN.values()
     for code in found.snippets
 )
@@ -127,7 +129,7 @@ def languages(keys: Collection[str]) -> str:
 class Snippet(Struct, frozen=True):
     """The code of a target for one bundle."""
 
-    target: Target
+    target: Caller
     code: str
 
     def to_dict(self) -> dict[str, Any]:
@@ -140,7 +142,7 @@ class Snippet(Struct, frozen=True):
         }
 
 
-def snippets(bundle: Bundle, name: str | None = None) -> tuple[list[Snippet], dict[str, str]]:
+def snippets(bundle: SnippetBundle, name: str | None = None) -> tuple[list[Snippet], dict[str, str]]:
     """(snippets, target → the format it lacks). ``name`` chooses one, all that begin so (``serving``), or the consumer.
 
     Raises UsageError for an unknown target, BundleError where the bundle lacks the format of all chosen, or was
@@ -165,7 +167,7 @@ def snippets(bundle: Bundle, name: str | None = None) -> tuple[list[Snippet], di
     return [Snippet(t, t.render(bundle)) for t in chosen if t.name not in lacking], lacking
 
 
-def _for_consumer(bundle: Bundle, name: str | None) -> str | None:
+def _for_consumer(bundle: SnippetBundle, name: str | None) -> str | None:
     """The target of a word of ``--for``, a profile's too; raises BundleError where the bundle is not for that one."""
     from export_model.converters.consumers.profiles import PROFILES
 

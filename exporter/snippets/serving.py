@@ -13,7 +13,7 @@ from typing import Any
 
 from export_model.converters.formats.registry import SAVED_MODEL
 from export_model.exporter.snippets.contract import (
-    Bundle,
+    SnippetBundle,
     action_meaning,
     example_shape,
     fill_template,
@@ -28,12 +28,12 @@ from export_model.signatures.spec import TensorSpec
 _MOST_NUMBERS = 400
 
 
-def docker(bundle: Bundle) -> str:
+def docker(bundle: SnippetBundle) -> str:
     """The container."""
     return fill_template("serving_docker.sh", folder=bundle.mount(SAVED_MODEL.main_of(bundle.name)), name=bundle.name)
 
 
-def rest(bundle: Bundle) -> str:
+def rest(bundle: SnippetBundle) -> str:
     """A call with curl."""
     inputs = bundle.signature.inputs
     rows = all(s.batched for s in inputs)
@@ -53,7 +53,7 @@ def rest(bundle: Bundle) -> str:
     return fill_template("serving_rest_large.sh", name=bundle.name, comments=comments, body=body)
 
 
-def grpc(bundle: Bundle) -> str:
+def grpc(bundle: SnippetBundle) -> str:
     """A call from Python."""
     run = [
         "request = predict_pb2.PredictRequest()",

@@ -11,12 +11,12 @@ from collections.abc import Sequence
 
 from msgspec import Struct
 
-from export_model.exporter.snippets.contract import Bundle, branch_lines, number_names
+from export_model.exporter.snippets.contract import SnippetBundle, branch_lines, number_names
 from export_model.signatures.roles import ACTION_SHAPE, IS_CONTINUOUS, MEMORY_SIZE, VERSION_NUMBER, Role
 from export_model.signatures.spec import TensorSpec
 
 
-class Generation(Struct, frozen=True):
+class VersionSpan(Struct, frozen=True):
     """A span of ML-Agents versions and what its brain can do with a graph."""
 
     name: str
@@ -33,17 +33,17 @@ class Generation(Struct, frozen=True):
 _STATE = ("State Node Name", "Observation Placeholder Name")
 _VECTOR = ("Vector Observation Node Name", "Visual Observation Placeholder Name")
 _INTERNAL = (
-    Generation("0.1", *_STATE, memory=False),
-    Generation("0.2", *_STATE),
-    Generation("0.3-0.4", *_VECTOR, previous_rank=1, asks=True),
-    Generation("0.5", *_VECTOR, previous_rank=2, masks=True, branches=True, asks=True),
+    VersionSpan("0.1", *_STATE, memory=False),
+    VersionSpan("0.2", *_STATE),
+    VersionSpan("0.3-0.4", *_VECTOR, previous_rank=1, asks=True),
+    VersionSpan("0.5", *_VECTOR, previous_rank=2, masks=True, branches=True, asks=True),
 )
 _NOISE = "epsilon"
 _FIXED = ("vector_observation", "prev_action", _NOISE, "action_masks", "recurrent_in")
 _NEEDED = (VERSION_NUMBER, IS_CONTINUOUS, MEMORY_SIZE, ACTION_SHAPE)
 
 
-def internal_brain(bundle: Bundle) -> str:
+def internal_brain(bundle: SnippetBundle) -> str:
     """The settings, and for which versions they hold."""
     able = [g for g in _INTERNAL if not _faults(bundle, g)]
     lines = [
@@ -65,7 +65,7 @@ def internal_brain(bundle: Bundle) -> str:
     return "\n".join([*lines, ""])
 
 
-def _settings(bundle: Bundle, able: Sequence[Generation]) -> list[str]:
+def _settings(bundle: SnippetBundle, able: Sequence[VersionSpan]) -> list[str]:
     signature = bundle.signature
     scope = _scope(bundle)
     vectors = [s for s in signature.inputs if s.role is Role.VECTOR]
@@ -92,7 +92,7 @@ def _settings(bundle: Bundle, able: Sequence[Generation]) -> list[str]:
     return [*lines, *(f"  {line}" for line in branch_lines(bundle))]
 
 
-def _placeholders(bundle: Bundle, scope: str) -> list[tuple[str, str]]:
+def _placeholders(bundle: SnippetBundle, scope: str) -> list[tuple[str, str]]:
     """Inputs that the brain does not know are drawn from a range, one number for all; a node must have each name."""
     rows = []
     for spec in bundle.signature.inputs:
@@ -106,7 +106,7 @@ def _placeholders(bundle: Bundle, scope: str) -> list[tuple[str, str]]:
     return [("Graph Placeholders", f"Size {len(rows)}{unread}"), *rows]
 
 
-def _brain(bundle: Bundle, vectors: list[TensorSpec], images: list[TensorSpec]) -> list[tuple[str, str]]:
+def _brain(bundle: SnippetBundle, vectors: list[TensorSpec], images: list[TensorSpec]) -> list[tuple[str, str]]:
     rows = []
     for spec in vectors:
         known = spec.distribution or {}
@@ -135,19 +135,19 @@ def _brain(bundle: Bundle, vectors: list[TensorSpec], images: list[TensorSpec]) 
     return rows
 
 
-def _action(bundle: Bundle) -> TensorSpec:
+def _action(bundle: SnippetBundle) -> TensorSpec:
     """The node that CoreBrainInternal reads: float for continuous actions, int64 for discrete ones."""
     head = bundle.heads[0]
     return head if head.is_continuous or head.dtype == "int64" else bundle.plain(head)
 
 
-def _scope(bundle: Bundle) -> str:
+def _scope(bundle: SnippetBundle) -> str:
     names = [s.name for s in (*bundle.signature.inputs, *bundle.heads)]
     scope = names[0].rpartition("/")[0]
     return f"{scope}/" if scope and all(n.startswith(f"{scope}/") for n in names) else ""
 
 
-def _faults(bundle: Bundle, generation: Generation) -> list[str]:
+def _faults(bundle: SnippetBundle, generation: VersionSpan) -> list[str]:
     signature, previous = bundle.signature, bundle.previous
     roles = [s.role for s in signature.inputs]
     board = any(s.role is Role.VECTOR and len(s.shape) > 2 for s in signature.inputs)
@@ -170,7 +170,7 @@ def _faults(bundle: Bundle, generation: Generation) -> list[str]:
     return [text for wrong, text in told if wrong]
 
 
-def _learning_brain(bundle: Bundle) -> str:
+def _learning_brain(bundle: SnippetBundle) -> str:
     signature = bundle.signature
     odd = [s.name for s in signature.inputs if s.name not in _FIXED and not s.name.startswith("visual_observation_")]
     missing = [name for name in _NEEDED if name not in bundle.nodes]

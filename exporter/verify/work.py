@@ -19,7 +19,7 @@ _FREE_AXIS = 8
 _SPEEDS = {r.name: r.products_per_second for r in RUNTIMES}
 
 
-class Allowance:
+class WorkAllowance:
     """The rows that a runtime may still be given of one policy, and what was left out for want of them."""
 
     def __init__(self, cost: int, runtime: str) -> None:
@@ -56,16 +56,16 @@ class Allowances:
 
     def __init__(self, graph: Graph) -> None:
         self._graph, self._cost = graph, 0
-        self._known: dict[tuple[str, str], Allowance] = {}
+        self._known: dict[tuple[str, str], WorkAllowance] = {}
         #: format → the runtime that is given the dearest input
         self._first: dict[str, str] = {}
 
-    def of(self, participant: Participant, purpose: str = "inputs") -> Allowance:
+    def of(self, participant: Participant, purpose: str = "inputs") -> WorkAllowance:
         """Return that of an artefact in a runtime; there is as much for inputs as for draws."""
         key = (f"{participant.name} in {participant.runtime}", purpose)
         if key not in self._known:
             self._cost = self._cost or products(self._graph)
-            self._known[key] = Allowance(self._cost, participant.runtime)
+            self._known[key] = WorkAllowance(self._cost, participant.runtime)
         return self._known[key]
 
     def is_first(self, participant: Participant) -> bool:

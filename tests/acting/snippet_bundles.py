@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from export_model.converters.formats.registry import DEFAULTS
 from export_model.exporter import export_model
 from export_model.exporter.export.pipeline import ExportOptions, export
-from export_model.exporter.snippets.contract import Bundle, read_bundle
+from export_model.exporter.snippets.contract import SnippetBundle, read_bundle
 from export_model.exporter.snippets.registry import snippets
 from fixtures import path as fixture
 
@@ -18,7 +18,7 @@ KINDS = ("continuous", "discrete", "sampled", "recurrent", "visual", "twobrains"
 NAMES = (*KINDS[:-1], "twobrains-StrikerBrain", "twobrains-Goalie-Brain-2", "own-names-Goalie-Brain-2")
 
 
-def bundle_of(out: Path, name: str) -> Bundle:
+def bundle_of(out: Path, name: str) -> SnippetBundle:
     """The bundle as it is seen from ``out``."""
     return replace(read_bundle(out / name), folder=Path(name))
 

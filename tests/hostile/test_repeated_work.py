@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from export_model.converters.files.children.memory_limits import Memory
+from export_model.converters.files.children.memory_limits import ChildMemory
 from export_model.converters.formats.keras.model import tensors_in
 from export_model.converters.formats.onnx.functions import inline_functions
 from export_model.converters.trainers.stable_baselines3.spaces import space_of
@@ -153,7 +153,7 @@ def test_ops_that_onnx_defines_by_others_are_counted_before_they_are_written_out
 
 
 def test_a_child_is_allowed_for_the_models_that_it_has() -> None:
-    memory = Memory(os.getpid())
+    memory = ChildMemory(os.getpid())
     memory._base, limits = 0, list[int]()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(

@@ -18,7 +18,7 @@ from export_model.exporter.play.environments import ENVIRONMENTS
 from export_model.exporter.play.episodes import SIDE_BY_SIDE, play_episodes
 from export_model.exporter.play.named import world_maker
 from export_model.exporter.play.options import PlayOptions
-from export_model.exporter.play.worlds import Outcome, View
+from export_model.exporter.play.worlds import StepOutcome, WorldView
 from export_model.exporter.verify.options import VerifyOptions
 from export_model.exporter.verify.plays import DIFFERENT, EQUIVALENT, NOT_DECIDED
 from export_model.signatures.errors import UsageError
@@ -155,9 +155,9 @@ def noisy(world: Any, spread: float) -> Any:
     chance = np.random.default_rng(0)
     step = world.step
 
-    def stepped(*actions: Any) -> Outcome:
+    def stepped(*actions: Any) -> StepOutcome:
         after = step(*actions)
-        return Outcome(
+        return StepOutcome(
             after.view, after.rewards + chance.normal(0, spread, len(after.rewards)), after.ended, after.success
         )
 
@@ -255,14 +255,14 @@ class Broken:
     def __init__(self, reward: float) -> None:
         self.name, self.notes, self._reward = "Broken", (), reward
 
-    def begin(self, episodes: int, seed: int) -> View:
+    def begin(self, episodes: int, seed: int) -> WorldView:
         self._count = episodes
-        return View({"state": np.zeros((episodes, 8), np.float32)})
+        return WorldView({"state": np.zeros((episodes, 8), np.float32)})
 
-    def step(self, continuous: Any, discrete: Any) -> Outcome:
+    def step(self, continuous: Any, discrete: Any) -> StepOutcome:
         nothing = np.zeros(self._count, bool)
-        view = View({"state": np.zeros((self._count, 8), np.float32)})
-        return Outcome(view, np.full(self._count, self._reward), nothing, nothing)
+        view = WorldView({"state": np.zeros((self._count, 8), np.float32)})
+        return StepOutcome(view, np.full(self._count, self._reward), nothing, nothing)
 
 
 @pytest.mark.parametrize(("reward", "says"), [(np.nan, "a reward of nan in step 1"), (0.0, "did not end within")])

@@ -34,7 +34,7 @@ def names(node: Any) -> Iterator[str]:
 
 def test_every_field_of_a_record_is_a_member() -> None:
     """As msgspec lists them, of which nothing that is left out for readers takes one away."""
-    kinds = [PolicySignature, contract.Head, Interface, contract.Distribution, contract.Preprocess]
+    kinds = [PolicySignature, contract.ContractHead, Interface, contract.Distribution, contract.Preprocess]
     assert {*names(schema_components(kinds))} <= {*names(schema("policy"))}
 
 

@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 
 import export_model as public
 from export_model.converters.consumers.profiles import PROFILES, profile
-from export_model.converters.consumers.robots.interface import Interface, Tensor, interface_of
+from export_model.converters.consumers.robots.interface import FileInterface, FileTensor, interface_of
 from export_model.converters.consumers.robots.loaders import LOADERS
 from export_model.exporter import export_model, load_policy, verify_bundle
 from export_model.exporter.verify.checks.consumer import consumers
@@ -249,8 +249,8 @@ def test_each_rule_names_a_file_of_the_project_that_it_is_of() -> None:
     st.integers(-1, 99),
 )  # fmt: skip
 def test_any_file_is_judged(inputs: list[Any], outputs: list[Any], version: int) -> None:
-    tensors = [tuple(Tensor(n, f, tuple(d)) for n, f, d in some) for some in (inputs, outputs)]
-    file = Interface(tensors[0], tensors[1], version, version)
+    tensors = [tuple(FileTensor(n, f, tuple(d)) for n, f, d in some) for some in (inputs, outputs)]
+    file = FileInterface(tensors[0], tensors[1], version, version)
     for loader in LOADERS.values():
         assert all(rule in loader.rules for rule in loader.faults(file))
 

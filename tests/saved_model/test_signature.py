@@ -12,7 +12,7 @@ from export_model.converters.files import tensorflow_messages as schema
 from export_model.converters.formats.frozen_graph.reader import from_graph_def, read_graph
 from export_model.converters.formats.saved_model.lengths import without_counted
 from export_model.converters.formats.saved_model.reader import read_saved_model
-from export_model.converters.formats.saved_model.signature import ModelSignature, Tensor, expose
+from export_model.converters.formats.saved_model.signature import ModelSignature, TensorInfo, expose
 from export_model.converters.formats.saved_model.signature import expose_signature as with_facts
 from export_model.converters.graph.nodes import Graph, Node, TensorShape
 from export_model.converters.graph.run import run_graph
@@ -42,7 +42,7 @@ def graph(*names: str) -> Graph:
 
 
 def exposed(base: Graph, inputs: dict[str, str], outputs: dict[str, str]) -> tuple[Graph, dict[str, Role]]:
-    sides = [{k: Tensor(v, F32) for k, v in side.items()} for side in (inputs, outputs)]
+    sides = [{k: TensorInfo(v, F32) for k, v in side.items()} for side in (inputs, outputs)]
     return expose(base, ModelSignature(*sides))
 
 
@@ -186,10 +186,10 @@ def test_parts_of_an_action_stand_side_by_side() -> None:
     base = Graph((*base.nodes[:-2], Node("one_axis", "Const", value=np.array(1, np.int32)), *base.nodes[-2:]))
     rows = TensorShape((None,))
 
-    def made(outputs: dict[str, Tensor]) -> tuple[Graph, SourceFacts]:
-        return with_facts(base, ModelSignature({"x": Tensor("x:0", F32, TensorShape((None, 2)))}, outputs))
+    def made(outputs: dict[str, TensorInfo]) -> tuple[Graph, SourceFacts]:
+        return with_facts(base, ModelSignature({"x": TensorInfo("x:0", F32, TensorShape((None, 2)))}, outputs))
 
-    class_of = {f"action/{n}": Tensor(f"c{i}:0", np.dtype("i4"), rows) for i, n in ((0, "10"), (1, "9"))}
+    class_of = {f"action/{n}": TensorInfo(f"c{i}:0", np.dtype("i4"), rows) for i, n in ((0, "10"), (1, "9"))}
     joined, facts = made(class_of)
     found = run_graph(joined, {"x": np.array([[1, -2], [0, 3]], np.float32)}, ["discrete_actions"])["discrete_actions"]
     np.testing.assert_array_equal(found, [[0, 0], [1, 1]])
@@ -197,7 +197,7 @@ def test_parts_of_an_action_stand_side_by_side() -> None:
         {"discrete_actions": Role.ACTION},
         ("discrete_actions is action/9, action/10, in this order",),
     ]
-    numbers = {"action/move": Tensor("b:0", F32, TensorShape((None, 2)))}
+    numbers = {"action/move": TensorInfo("b:0", F32, TensorShape((None, 2)))}
     hybrid, facts = made({**numbers, "action/jump": class_of["action/9"]})
     assert facts.outputs == {"discrete_actions": Role.ACTION, "continuous_actions": Role.ACTION}
     assert (hybrid["continuous_actions"].origin, hybrid["discrete_actions"].origin) == ("b:0", "c1:0")
@@ -210,8 +210,8 @@ def test_parts_of_several_kinds_are_joined_beside_a_node_of_that_name() -> None:
     nodes += [Node("axis", "Const", value=np.array(1, np.int32))]
     kinds = {"long": np.dtype("i8"), "short": np.dtype("i4")}
     nodes += [Node(n, "ArgMax", ("discrete_actions", "axis"), {"output_type": kind}) for n, kind in kinds.items()]
-    parts = {f"action/{i}": Tensor(f"{n}:0", kinds[n], rows) for i, n in enumerate(kinds)}
-    joined, _ = with_facts(Graph(tuple(nodes)), ModelSignature({"x": Tensor("x:0", F32, x)}, parts))
+    parts = {f"action/{i}": TensorInfo(f"{n}:0", kinds[n], rows) for i, n in enumerate(kinds)}
+    joined, _ = with_facts(Graph(tuple(nodes)), ModelSignature({"x": TensorInfo("x:0", F32, x)}, parts))
     assert joined["discrete_actions"].op == "ConcatV2"
     assert {infer_types(joined)[r].dtype for r in joined["discrete_actions"].inputs[:-1]} == {np.dtype("i8")}
     found = run_graph(joined, {"x": np.array([[1, -2], [0, 3]], np.float32)}, ["discrete_actions"])["discrete_actions"]
@@ -233,11 +233,11 @@ def test_an_input_of_which_only_the_length_is_read_is_none() -> None:
     )
     row = TensorShape((None,))
     inputs = {
-        "0/observation": Tensor("vector_observation:0", F32, TensorShape((None, 3))),
-        "0/step_type": Tensor("step:0", np.dtype("i4"), row),
-        "0/other": Tensor("looked_at:0", np.dtype("i4"), row),
+        "0/observation": TensorInfo("vector_observation:0", F32, TensorShape((None, 3))),
+        "0/step_type": TensorInfo("step:0", np.dtype("i4"), row),
+        "0/other": TensorInfo("looked_at:0", np.dtype("i4"), row),
     }
-    outputs = {"action": Tensor("action:0"), "zeros": Tensor("zeros:0"), "other": Tensor("looked_at:0")}
+    outputs = {"action": TensorInfo("action:0"), "zeros": TensorInfo("zeros:0"), "other": TensorInfo("looked_at:0")}
     left = without_counted(message, ModelSignature(inputs, outputs))
     assert sorted(left.inputs) == ["0/observation", "0/other"]
     made = normalise(from_graph_def(message).prune(["zeros"]))

@@ -12,7 +12,7 @@ from pathlib import Path
 import onnx
 import pytest
 
-from export_model.converters.consumers.unity.constructs import Model, constructs
+from export_model.converters.consumers.unity.constructs import ConstructModel, constructs
 from export_model.converters.consumers.unity.importers import IMPORTERS
 from export_model.converters.consumers.unity.readings import MEASURED, Reading, misreadings
 from export_model.converters.formats.format import WriteOptions
@@ -43,7 +43,7 @@ ONLY_IN_1_1 = {
 FIRST = next(iter(IMPORTERS))
 
 
-def wrong_readings(model: Model) -> Iterator[str]:
+def wrong_readings(model: ConstructModel) -> Iterator[str]:
     for found in misreadings(model):
         if found.rule.reading is not Reading.WRONG:
             continue
@@ -52,11 +52,11 @@ def wrong_readings(model: Model) -> Iterator[str]:
             yield f"{found.importer}: {found.construct.name} = {found.construct.op}({forms}): {found.rule.says}"
 
 
-def unknown_operators(model: Model) -> set[str]:
+def unknown_operators(model: ConstructModel) -> set[str]:
     return {c.op for c in model} - MEASURED
 
 
-def emitted(policies: Iterable[Policy]) -> Iterator[Model]:
+def emitted(policies: Iterable[Policy]) -> Iterator[ConstructModel]:
     """What the ONNX of each policy is made of."""
     for policy in policies:
         (data,) = write(policy, WriteOptions('{"tool": {"version": "test"}}')).values()

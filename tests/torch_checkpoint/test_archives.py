@@ -19,7 +19,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from export_model.converters.files.torch_archive import Archive
-from export_model.converters.files.unpickle import Tensor, unpickle
+from export_model.converters.files.unpickle import PickledTensor, unpickle
 from export_model.exporter.export.sources import read_source
 from export_model.signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError
 from fixtures.torch_checkpoint import FOLDER
@@ -40,7 +40,7 @@ def archive(folder: Path, data: bytes) -> Archive:
 
 
 def tensor(opened: Archive) -> np.ndarray:
-    assert isinstance(opened.value, Tensor)
+    assert isinstance(opened.value, PickledTensor)
     return opened.array(opened.value, "x")
 
 

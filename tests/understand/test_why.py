@@ -18,7 +18,7 @@ from export_model.converters.graph.nodes import Graph, Node
 from export_model.converters.policy.brains import _ACTIONS, _DECLARED_ACTIONS, explain_outputs, find_brains
 from export_model.converters.policy.input_rules import BY_NAME, BY_READERS, LAST_RESORTS
 from export_model.converters.policy.inputs import classify_inputs, explain_inputs
-from export_model.converters.policy.rules import Decision
+from export_model.converters.policy.rules import RoleDecision
 from export_model.exporter import inspect_model
 from export_model.exporter.export.sources import read_source
 from export_model.signatures.errors import ExportModelError, SignatureError
@@ -73,7 +73,7 @@ READ: list[tuple[Graph, bool]] = [
 ]
 
 
-def decided(g: Graph, *, declared: bool) -> dict[str, Decision]:
+def decided(g: Graph, *, declared: bool) -> dict[str, RoleDecision]:
     (brain,) = find_brains(g)
     return {d.tensor: d for d in explain_inputs(g, brain, {}, {}, {}, declared=declared)}
 

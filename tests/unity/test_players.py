@@ -17,7 +17,7 @@ import pytest
 from export_model.converters.consumers.unity.checker import ModeVerdict, check_file
 from export_model.converters.consumers.unity.consumers import CONSUMERS, EARLIER, consumer
 from export_model.converters.consumers.unity.findings import Thrown
-from export_model.converters.consumers.unity.players import PLAYERS, Outcome
+from export_model.converters.consumers.unity.players import PLAYERS, PlayOutcome
 from export_model.converters.consumers.unity.settings import Brain, Sensor
 from tests.unity.conftest import UNITY, lines
 
@@ -51,7 +51,7 @@ def test_a_model_is_played_as_recorded(row: dict[str, Any], unity_data: Path) ->
         recorded = row["verdicts"][COLUMNS[name]]
         verdict = check_file(UNITY / "r3" / "minimal" / row["file"], consumer(name), agent(row))
         if "process_killed" in recorded:
-            assert {p.outcome for p in verdict.played} == {Outcome.DIES}, name
+            assert {p.outcome for p in verdict.played} == {PlayOutcome.DIES}, name
             assert not any(verdict.accepted.values())
             continue
         assert (verdict.refused is None) is recorded["imported"], name
@@ -125,9 +125,9 @@ def fate(row: dict[str, Any], played: Any, agents: int) -> str:
     if isinstance(played, dict):
         text = str(played["throws"])
         if text.startswith(NO_ACTION):
-            return Outcome.NOTHING.value
+            return PlayOutcome.NOTHING.value
         return plain(text).replace(f"received ({agents}, ", "received (N, ")
-    return "right" if is_right(row, played, agents) else Outcome.WRONG.value
+    return "right" if is_right(row, played, agents) else PlayOutcome.WRONG.value
 
 
 def is_right(row: dict[str, Any], played: list[dict[str, list[float]]], agents: int) -> bool:
@@ -187,7 +187,7 @@ def test_a_list_of_entities_is_read_as_recorded(row: dict[str, Any], unity_data:
     verdict = check_file(UNITY / "r3" / "minimal" / f"{row['id']}.onnx", consumer(name))
     assert verdict.brain.sensors[0].shape == (3, 4)
     assert set(verdict.plays.values()) == {right}
-    assert [p.outcome for p in verdict.played] == ([] if right else [Outcome.WRONG])
+    assert [p.outcome for p in verdict.played] == ([] if right else [PlayOutcome.WRONG])
 
 
 def cases() -> Iterator[Any]:

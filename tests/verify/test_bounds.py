@@ -17,7 +17,7 @@ from export_model.exporter.verify.participants import policy_under_test
 from export_model.exporter.verify.session import Session
 from export_model.exporter.verify.statistics import chi_square_survival, dependent, fit, fit_all, same_distribution
 from export_model.exporter.verify.tolerances import Tolerance
-from export_model.exporter.verify.work import Allowance, products
+from export_model.exporter.verify.work import WorkAllowance, products
 from export_model.signatures.sampling import Case
 from tests.handmade import continuous_policy
 from tests.verify.judged import KNOWN, Pool, compiled
@@ -241,8 +241,8 @@ def test_draws_that_repeat_are_dependent() -> None:
 
 def test_a_slow_runtime_gets_as_many_rows_as_it_has_time_for(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("export_model.exporter.verify.work._SPEEDS", {"slow": 100.0})
-    left = Allowance(cost=10, runtime="slow")
+    left = WorkAllowance(cost=10, runtime="slow")
     assert left.left == 200 and left.takes(150, "a") and not left.takes(51, "b") and left.takes(50, "c")
     assert left.note("it") == "it is slow (1e-05 million products for a row); left out there: b"
-    assert Allowance(10, "slow").note("it") is None
+    assert WorkAllowance(10, "slow").note("it") is None
     assert products(compiled(continuous_policy()).graph) >= 6

@@ -12,7 +12,7 @@ from export_model.converters.graph.types import INT64
 from export_model.converters.policy.action import action_meaning
 from export_model.converters.policy.action_values import (
     EVIDENCE,
-    Candidate,
+    OutputCandidate,
     evidence_of,
     is_q_name,
     is_scores,
@@ -97,12 +97,12 @@ def _is_open(c: Compilation) -> bool:
     return (is_scores(name) or not says_action(name)) and not masked and may_be_values(c.graph, tensor)
 
 
-def _candidate(c: Compilation) -> Candidate:
+def _candidate(c: Compilation) -> OutputCandidate:
     reference = next(ref for _, role, ref in c.brain.outputs if role is Role.ACTION)
     source = c.sources.get(_ACTION)
     name = (source if isinstance(source, str) else reference).removesuffix(":0")
     layer = last_layer(c.source, reference)
-    return Candidate(c.graph, c.fetches[_ACTION], name, layer, c.facts.model_name, c.facts.loss)
+    return OutputCandidate(c.graph, c.fetches[_ACTION], name, layer, c.facts.model_name, c.facts.loss)
 
 
 def _width(c: Compilation, output: str) -> int | None:

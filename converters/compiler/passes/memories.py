@@ -17,7 +17,7 @@ from export_model.converters.graph.types import FLOAT32, static_shape
 from export_model.converters.policy.facts import SourceFacts
 from export_model.converters.policy.inputs import role_by_name
 from export_model.converters.policy.memories import paired_memories
-from export_model.converters.policy.rules import Decision
+from export_model.converters.policy.rules import RoleDecision
 from export_model.signatures.errors import SignatureError
 from export_model.signatures.memories import SeparateMemory, SourcePart
 from export_model.signatures.roles import ACTING, CANONICAL, Role
@@ -74,7 +74,7 @@ def _reasons(
     facts: SourceFacts,
     made: tuple[str, str],
     origins: Mapping[str, str],
-) -> dict[str, Decision]:
+) -> dict[str, RoleDecision]:
     """Why the inputs and outputs that were joined are the memory."""
     said = []
     for memory in memories:
@@ -85,8 +85,10 @@ def _reasons(
     text = f"it stands for {'; '.join(said)}"
     taken, given = made
     return {
-        taken: Decision(taken, Role.MEMORY_IN, text),
-        given: Decision(given, Role.MEMORY_OUT, f"it is fed back to {', '.join(origins[m.input] for m in memories)}"),
+        taken: RoleDecision(taken, Role.MEMORY_IN, text),
+        given: RoleDecision(
+            given, Role.MEMORY_OUT, f"it is fed back to {', '.join(origins[m.input] for m in memories)}"
+        ),
     }
 
 

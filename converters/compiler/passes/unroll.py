@@ -7,7 +7,7 @@ cells go the same way, as do ``tf.cond`` branches whose predicate is a constant.
 
 Precondition: normalised graph, ``sequence_length`` constant. Postcondition: no control flow is left. Raises
 UnsupportedOpError where a predicate is not constant or a loop runs for more than ``MAX_TURNS``; NotAPolicyError where
-the turns are more than ``MAX_NODES`` together, or write more than ``MAX_HANDED_ON``.
+the turns are more than ``MAX_POLICY_NODES`` together, or write more than ``MAX_HANDED_ON``.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from export_model.signatures.errors import GraphError, NotAPolicyError, Unsuppor
 
 MAX_TURNS = 64
 #: Of a policy, before its loops are unrolled and after.
-MAX_NODES = 1 << 14
+MAX_POLICY_NODES = 1 << 14
 #: Elements of tensor arrays that may be handed on, from each writing to the next: an array of 64 has 2,080.
 MAX_HANDED_ON = 1 << 22
 
@@ -334,9 +334,9 @@ class _Unroller:
 
     def _room(self, count: int) -> None:
         """Raise NotAPolicyError where so many more nodes would be too many."""
-        if len(self.editor.nodes) + count > MAX_NODES:
+        if len(self.editor.nodes) + count > MAX_POLICY_NODES:
             raise NotAPolicyError(
-                f"the graph's loops unroll to more than {MAX_NODES} nodes",
+                f"the graph's loops unroll to more than {MAX_POLICY_NODES} nodes",
                 why="no more are converted; a policy has some hundreds",
                 fix="give the policy alone; where a placeholder decides the number of turns, set it: --set NAME=VALUE",
             )

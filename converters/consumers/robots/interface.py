@@ -10,7 +10,7 @@ from msgspec import Struct
 FLOAT = 1
 
 
-class Tensor(Struct, frozen=True):
+class FileTensor(Struct, frozen=True):
     """An input or output; in ``dims`` None is a free length."""
 
     name: str
@@ -23,19 +23,19 @@ class Tensor(Struct, frozen=True):
         return f"{self.name} [{', '.join('?' if d is None else str(d) for d in self.dims)}]"
 
 
-class Interface(Struct, frozen=True):
+class FileInterface(Struct, frozen=True):
     """The inputs and outputs of a file, its opset of ONNX's own operators and its IR version."""
 
-    inputs: tuple[Tensor, ...]
-    outputs: tuple[Tensor, ...]
+    inputs: tuple[FileTensor, ...]
+    outputs: tuple[FileTensor, ...]
     opset: int
     ir: int
 
 
-def interface_of(model: Any) -> Interface:
+def interface_of(model: Any) -> FileInterface:
     """The interface of a ModelProto."""
     stored = {t.name for t in model.graph.initializer}
-    return Interface(
+    return FileInterface(
         tuple(_tensor(v) for v in model.graph.input if v.name not in stored),
         tuple(_tensor(v) for v in model.graph.output),
         max((o.version for o in model.opset_import if o.domain in ("", "ai.onnx")), default=1),
@@ -43,7 +43,7 @@ def interface_of(model: Any) -> Interface:
     )
 
 
-def _tensor(value: Any) -> Tensor:
+def _tensor(value: Any) -> FileTensor:
     kind = value.type.tensor_type
     dims = (d.dim_value if d.HasField("dim_value") else None for d in kind.shape.dim)
-    return Tensor(value.name, kind.elem_type == FLOAT, tuple(dims))
+    return FileTensor(value.name, kind.elem_type == FLOAT, tuple(dims))

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from msgspec import Struct
 
-from export_model.converters.consumers.robots.interface import Interface
+from export_model.converters.consumers.robots.interface import FileInterface
 from export_model.signatures.errors import ProfileError
 
 _RNN = "leggedrobotics/rsl_rl@14d428d7 rsl_rl/models/rnn_model.py"
@@ -33,7 +33,7 @@ class LoaderRule(Struct, frozen=True):
 
     says: str
     evidence: str
-    holds: Callable[[Interface], bool]
+    holds: Callable[[FileInterface], bool]
 
 
 class Loader(Struct, frozen=True):
@@ -42,7 +42,7 @@ class Loader(Struct, frozen=True):
     name: str
     rules: tuple[LoaderRule, ...]
 
-    def faults(self, file: Interface) -> Iterator[LoaderRule]:
+    def faults(self, file: FileInterface) -> Iterator[LoaderRule]:
         """The rules that a file does not meet."""
         return (rule for rule in self.rules if not rule.holds(file))
 
@@ -51,11 +51,11 @@ def _names(tensors: Sequence[object]) -> list[str]:
     return [getattr(t, "name", "") for t in tensors]
 
 
-def _shape(file: Interface, name: str) -> tuple[int | None, ...]:
+def _shape(file: FileInterface, name: str) -> tuple[int | None, ...]:
     return next((t.dims for t in (*file.inputs, *file.outputs) if t.name == name), ())
 
 
-def _all_float(file: Interface) -> bool:
+def _all_float(file: FileInterface) -> bool:
     return all(t.is_float for t in (*file.inputs, *file.outputs))
 
 

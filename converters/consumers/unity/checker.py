@@ -13,11 +13,11 @@ from export_model.converters.consumers.unity import barracuda_model, importing, 
 from export_model.converters.consumers.unity.assumed import assumed_brain, nn_ranks, onnx_ranks
 from export_model.converters.consumers.unity.constructs import INPUT, OUTPUT, constructs
 from export_model.converters.consumers.unity.consumers import CONSUMERS, Consumer, Engine
-from export_model.converters.consumers.unity.findings import Finding, Severity, Thrown, UnityThrows
+from export_model.converters.consumers.unity.findings import Complaint, Severity, Thrown, UnityThrows
 from export_model.converters.consumers.unity.model import CheckedModel
 from export_model.converters.consumers.unity.onnx_file import OnnxFile, read_onnx_file
-from export_model.converters.consumers.unity.players import PLAYERS, Outcome
-from export_model.converters.consumers.unity.playing import Played, play, throws
+from export_model.converters.consumers.unity.players import PLAYERS, PlayOutcome
+from export_model.converters.consumers.unity.playing import PlayEvent, play, throws
 from export_model.converters.consumers.unity.readings import Reading, misreadings
 from export_model.converters.consumers.unity.scene import Scene
 from export_model.converters.consumers.unity.settings import Brain
@@ -44,10 +44,10 @@ class ModeVerdict(Struct, frozen=True):
     """
 
     load: Thrown | None
-    checks: tuple[Finding, ...]
+    checks: tuple[Complaint, ...]
     check_throws: Thrown | None = None
     fetched: tuple[str, ...] | Thrown = ()
-    played: tuple[Played, ...] = ()
+    played: tuple[PlayEvent, ...] = ()
 
     @property
     def checked(self) -> bool:
@@ -91,7 +91,7 @@ class UnityVerdict(Struct, frozen=True):
     brain: Brain
     refused: Thrown | None
     modes: Mapping[str, ModeVerdict] = field(default_factory=dict)
-    misread: tuple[Finding, ...] = ()
+    misread: tuple[Complaint, ...] = ()
     assumed: bool = False
 
     @property
@@ -111,7 +111,7 @@ class UnityVerdict(Struct, frozen=True):
         return {mode: mode in self.modes and self.modes[mode].plays for mode in modes_of(self.consumer)}
 
     @property
-    def played(self) -> tuple[Played, ...]:
+    def played(self) -> tuple[PlayEvent, ...]:
         """What the player trips over, in either mode, each once."""
         return tuple(dict.fromkeys(played for mode in self.modes.values() for played in mode.played))
 
@@ -132,7 +132,7 @@ class UnityVerdict(Struct, frozen=True):
             "overlooked": [
                 {"severity": "warning", "message": p.message, "where": p.where, "fix": p.fix}
                 for p in self.played
-                if p.outcome not in (Outcome.REFUSED, Outcome.LOADING)
+                if p.outcome not in (PlayOutcome.REFUSED, PlayOutcome.LOADING)
             ],
             "misread": [f.to_dict() for f in self.misread],
         }
@@ -205,7 +205,7 @@ def _verdict_on_import(
     model: CheckedModel,
     ranks: Sequence[int],
     file: OnnxFile | None = None,
-    wrong: tuple[Finding, ...] = (),
+    wrong: tuple[Complaint, ...] = (),
     nn: nn_format.NnModel | None = None,
 ) -> UnityVerdict:
     """The verdict on a model that was imported; ``ranks`` are the numbers of axes of its inputs."""
@@ -231,7 +231,7 @@ def _mode(
     checks = _try(lambda: rules.check(model, brain, deterministic, consumer))
     fetched = _try(lambda: model.fetched_outputs(deterministic))
     load = _try(lambda: rules.version_error(model, consumer.profile)) if consumer.reads_version else None
-    if isinstance(load, Finding):
+    if isinstance(load, Complaint):
         load = Thrown("UnityAgentsException", load.message, load.where, load.fix)
     if isinstance(checks, Thrown):
         return ModeVerdict(load, (), checks, fetched)
@@ -245,10 +245,10 @@ def _play(
     brain: Brain,
     file: OnnxFile | None,
     nn: nn_format.NnModel | None,
-) -> tuple[Played, ...]:
+) -> tuple[PlayEvent, ...]:
     for thrown in (judged.load, judged.fetched):
         if isinstance(thrown, Thrown):
-            return (throws(Outcome.LOADING, thrown),)
+            return (throws(PlayOutcome.LOADING, thrown),)
     assert not isinstance(judged.fetched, Thrown)
     return play(Scene(consumer, model, brain, judged.fetched, file, nn))
 
@@ -269,7 +269,7 @@ _SAYS = {
 }
 
 
-def _misread(file: OnnxFile, consumer: Consumer) -> tuple[Finding, ...]:
+def _misread(file: OnnxFile, consumer: Consumer) -> tuple[Complaint, ...]:
     """The constructs of a file that its importer does not read rightly: one finding per kind, with its places.
 
     Most of these give no error in Unity. Empty where the shapes of the file contradict each other.
@@ -285,7 +285,7 @@ def _misread(file: OnnxFile, consumer: Consumer) -> tuple[Finding, ...]:
         op = {INPUT: "an input", OUTPUT: "an output"}.get(reading.construct.op, reading.construct.op)
         found.setdefault((reading.rule.reading, op, reading.rule.says), []).append(reading.construct.name)
     return tuple(
-        Finding(
+        Complaint(
             Severity.ERROR,
             f"{op} {_SAYS[kind]}: {says}",
             _places(names),

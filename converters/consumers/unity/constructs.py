@@ -23,7 +23,7 @@ MOST_AXES = 4
 _STANDARD = ("", "ai.onnx")
 
 
-class Source(StrEnum):
+class OperandSource(StrEnum):
     """Where an operand comes from, as an importer sees it (nothing folded)."""
 
     CONSTANT = "constant"  # an initializer or a Constant node
@@ -38,7 +38,7 @@ class Operand(Struct, frozen=True):
     """One operand: ``shape`` with None for a free length, None where it is not known; ``value`` of constants."""
 
     name: str
-    source: Source
+    source: OperandSource
     shape: tuple[int | None, ...] | None = None
     dtype: np.dtype | None = None
     value: np.ndarray | None = None
@@ -51,7 +51,7 @@ class Operand(Struct, frozen=True):
     @property
     def is_constant(self) -> bool:
         """Whether it is a constant, turned or not."""
-        return self.source in (Source.CONSTANT, Source.TURNED)
+        return self.source in (OperandSource.CONSTANT, OperandSource.TURNED)
 
 
 class Construct(Struct, frozen=True):
@@ -63,11 +63,11 @@ class Construct(Struct, frozen=True):
     operands: tuple[Operand, ...]
     attributes: Mapping[str, Any]
     outputs: tuple[str, ...]
-    model: Model
+    model: ConstructModel
 
     def operand(self, index: int) -> Operand:
         """The operand at ``index``; one of source ABSENT where there is none."""
-        return self.operands[index] if index < len(self.operands) else Operand("", Source.ABSENT)
+        return self.operands[index] if index < len(self.operands) else Operand("", OperandSource.ABSENT)
 
     def attribute(self, name: str, default: Any = None) -> Any:
         """An attribute as a Python value."""
@@ -93,7 +93,7 @@ class Construct(Struct, frozen=True):
         return tuple(c for name in self.outputs for c in self.model.readers.get(name, ()))
 
 
-class Model:
+class ConstructModel:
     """The constructs of a model in its order, with the values that connect them."""
 
     def __init__(self) -> None:
@@ -114,7 +114,7 @@ class Model:
             self.readers.setdefault(operand.name, []).append(construct)
 
 
-def constructs(proto: Any) -> Model:
+def constructs(proto: Any) -> ConstructModel:
     """The constructs of a ModelProto with all its data, inputs first, outputs last.
 
     Raises DamagedFileError where ONNX's shape inference refuses the model.
@@ -135,31 +135,35 @@ def constructs(proto: Any) -> Model:
     opset = next((int(o.version) for o in proto.opset_import if o.domain in _STANDARD), 1)
     values = {t.name: onnx.numpy_helper.to_array(t) for t in graph.initializer}
     types = {v.name: v.type.tensor_type for v in (*graph.value_info, *graph.input, *graph.output)}
-    model = Model()
+    model = ConstructModel()
 
     def operand(name: str) -> Operand:
         if not name:
-            return Operand("", Source.ABSENT)
+            return Operand("", OperandSource.ABSENT)
         if name in values:
             value = values[name]
-            return Operand(name, Source.CONSTANT, value.shape, value.dtype, value)
+            return Operand(name, OperandSource.CONSTANT, value.shape, value.dtype, value)
         shape, dtype = _type_of(onnx, types.get(name))
         if name in model.inputs:
-            return Operand(name, Source.INPUT, shape, dtype)
+            return Operand(name, OperandSource.INPUT, shape, dtype)
         maker = model.makers.get(name)
-        if maker is not None and maker.op in ("Transpose", "Identity") and maker.operand(0).source is Source.CONSTANT:
-            source = Source.TURNED if maker.op == "Transpose" else Source.COPIED
+        if (
+            maker is not None
+            and maker.op in ("Transpose", "Identity")
+            and maker.operand(0).source is OperandSource.CONSTANT
+        ):
+            source = OperandSource.TURNED if maker.op == "Transpose" else OperandSource.COPIED
             return Operand(name, source, shape, dtype, maker.operand(0).value)
-        return Operand(name, Source.COMPUTED, shape, dtype)
+        return Operand(name, OperandSource.COMPUTED, shape, dtype)
 
     for value in graph.input:
         if value.name not in values:
-            model.inputs[value.name] = Operand(value.name, Source.INPUT, *_type_of(onnx, value.type.tensor_type))
+            model.inputs[value.name] = Operand(value.name, OperandSource.INPUT, *_type_of(onnx, value.type.tensor_type))
             model.add(
                 Construct(value.name, INPUT, opset, operands=(), attributes={}, outputs=(value.name,), model=model)
             )
     model.outputs = {
-        v.name: Operand(v.name, Source.COMPUTED, *_type_of(onnx, v.type.tensor_type)) for v in graph.output
+        v.name: Operand(v.name, OperandSource.COMPUTED, *_type_of(onnx, v.type.tensor_type)) for v in graph.output
     }
     for node in graph.node:
         attributes = {a.name: onnx.helper.get_attribute_value(a) for a in node.attribute}

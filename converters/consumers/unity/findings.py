@@ -15,7 +15,7 @@ class Severity(StrEnum):
     INFO = "info"
 
 
-class Finding(Record, frozen=True):
+class Complaint(Record, frozen=True):
     """One thing that is wrong: ``message`` in Unity's words where Unity says it, ``where`` it lies, how to mend it."""
 
     severity: Severity
@@ -24,9 +24,9 @@ class Finding(Record, frozen=True):
     fix: str
 
 
-def warning(message: str, where: str, fix: str) -> Finding:
+def warning(message: str, where: str, fix: str) -> Complaint:
     """What does not end anything."""
-    return Finding(Severity.WARNING, message, where, fix)
+    return Complaint(Severity.WARNING, message, where, fix)
 
 
 class Thrown(Record, frozen=True, omit_defaults=False, rename={"worded": "worded_by_unity"}):

@@ -7,36 +7,36 @@ from collections.abc import Mapping
 
 from export_model.converters.consumers.mlagents.names import ACTION, CONTINUOUS
 from export_model.converters.consumers.unity.layout import reads_flat
-from export_model.converters.consumers.unity.scene import Port, Scene
+from export_model.converters.consumers.unity.scene import Scene, ScenePort
 from export_model.signatures.roles import MEMORY_SIZE
 
 
-def sensor_size(port: Port) -> int:
+def sensor_size(port: ScenePort) -> int:
     """The numbers that the sensor gives."""
     return math.prod(port.sensor)
 
 
-def lacks_axes(port: Port) -> bool:
+def lacks_axes(port: ScenePort) -> bool:
     """Whether it has fewer axes than what is written into it."""
     return len(port.lengths) < len(port.sensor)
 
 
-def outside_last(port: Port, axes: int) -> bool:
+def outside_last(port: ScenePort, axes: int) -> bool:
     """Whether an agent's numbers lie on other axes than the last: players count from the agent by the last lengths."""
     return any(length > 1 for length in port.lengths[: len(port.lengths) - axes])
 
 
-def off_channels(port: Port) -> bool:
+def off_channels(port: ScenePort) -> bool:
     """Whether numbers lie on Barracuda's height or width."""
     return port.view is not None and max(port.view.height, 1) * max(port.view.width, 1) > 1
 
 
-def masks_of_another_size(port: Port, scene: Scene) -> bool:
+def masks_of_another_size(port: ScenePort, scene: Scene) -> bool:
     """Whether masks have another number of columns than the agent has actions."""
     return bool(scene.brain.branches) and port.size not in (1, sum(scene.brain.branches))
 
 
-def written_outside(port: Port, scene: Scene) -> bool:
+def written_outside(port: ScenePort, scene: Scene) -> bool:
     """Whether Barracuda's tensor ends before the sensor's last number, at the place that ML-Agents writes it to."""
     del scene
     assert port.view is not None
@@ -45,7 +45,7 @@ def written_outside(port: Port, scene: Scene) -> bool:
     return _last_place(port) >= port.view.height * port.view.width * port.view.channels
 
 
-def turned_picture(port: Port, scene: Scene) -> bool:
+def turned_picture(port: ScenePort, scene: Scene) -> bool:
     """Whether a picture is written into a tensor of other lengths that has room for it."""
     if len(port.sensor) != 3 or written_outside(port, scene):
         return False
@@ -53,7 +53,7 @@ def turned_picture(port: Port, scene: Scene) -> bool:
     return port.sensor != (port.view.channels, port.view.height, port.view.width)
 
 
-def _last_place(port: Port) -> int:
+def _last_place(port: ScenePort) -> int:
     assert port.view is not None
     if len(port.sensor) < 3:
         return sensor_size(port) - 1
@@ -61,14 +61,14 @@ def _last_place(port: Port) -> int:
     return ((height - 1) * port.view.width + width - 1) * port.view.channels + channels - 1
 
 
-def misreads_entities(port: Port, scene: Scene) -> bool:
+def misreads_entities(port: ScenePort, scene: Scene) -> bool:
     """Whether a list of entities is read in another order than the one in which it is written."""
     if len(port.sensor) != 2 or min(port.sensor) < 2:
         return False
     return _keeps_entities(port) or not reads_flat(port.name, scene.file, scene.nn)
 
 
-def _keeps_entities(port: Port) -> bool:
+def _keeps_entities(port: ScenePort) -> bool:
     return port.view is not None and port.view.kept
 
 
@@ -76,7 +76,7 @@ _TURNED = "transposed, and ML-Agents writes it flat: the model sees the observat
 _KEPT = "channels last, as the pictures: the agent is asked for another sensor, and the model throws or acts otherwise"
 
 
-def action_width(port: Port, scene: Scene) -> int:
+def action_width(port: ScenePort, scene: Scene) -> int:
     """The columns that the agent takes of an action."""
     brain = scene.brain
     if port.name.endswith(CONTINUOUS) or (port.name == ACTION and brain.continuous):
@@ -84,24 +84,24 @@ def action_width(port: Port, scene: Scene) -> int:
     return sum(brain.branches) if scene.old_names else len(brain.branches)
 
 
-def gives_too_few(port: Port, scene: Scene) -> bool:
+def gives_too_few(port: ScenePort, scene: Scene) -> bool:
     """Whether actions have fewer columns than the agent takes."""
     return port.dims is not None and len(port.dims) > 1 and port.size < action_width(port, scene)
 
 
-def gives_too_many(port: Port, scene: Scene) -> bool:
+def gives_too_many(port: ScenePort, scene: Scene) -> bool:
     """Whether actions have more columns than the agent takes, and it takes some."""
     return port.dims is not None and len(port.dims) > 1 and port.size > action_width(port, scene) > 0
 
 
-def given_off_channels(port: Port, scene: Scene) -> bool:
+def given_off_channels(port: ScenePort, scene: Scene) -> bool:
     """Whether actions lie on other axes than the second."""
     if port.dims is None or action_width(port, scene) < 2:
         return False
     return len(port.dims) < 2 or port.size != port.lengths[0]
 
 
-def fields(port: Port, scene: Scene) -> Mapping[str, object]:
+def fields(port: ScenePort, scene: Scene) -> Mapping[str, object]:
     """What the sentences of a row may name."""
     free = "N" if port.dims is None or not port.dims or port.dims[0] is None or port.view is None else port.dims[0]
     lengths = port.lengths if port.dims is not None or port.view is not None else ()
@@ -126,5 +126,5 @@ def fields(port: Port, scene: Scene) -> Mapping[str, object]:
     }
 
 
-def _columns(port: Port, scene: Scene) -> int:
+def _columns(port: ScenePort, scene: Scene) -> int:
     return sum(scene.brain.branches) if port.view is not None else action_width(port, scene)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 
 from msgspec import Struct
 
-from export_model.converters.consumers.unity.players import Outcome
+from export_model.converters.consumers.unity.players import PlayOutcome
 from export_model.converters.formats.barracuda.assemble import FLATTENS_ITSELF
 from export_model.converters.formats.barracuda.format import Layer, NnModel
 from export_model.converters.graph.ops.barracuda.vocabulary import Activation, LayerType
@@ -20,7 +20,7 @@ class LayerRow(Struct, frozen=True):
     """A form of a layer, the consumers that trip over it, and what comes of it."""
 
     consumers: frozenset[str]
-    outcome: Outcome
+    outcome: PlayOutcome
     when: Callable[[Layer, NnModel], bool]
     says: str
     fix: str
@@ -74,7 +74,7 @@ def _off_size(layer: Layer, model: NnModel) -> str:
 _ROWS = (
     LayerRow(
         consumers=frozenset({"1.0.8", "1.9.1", "2.0.1"}),
-        outcome=Outcome.FIRST,
+        outcome=PlayOutcome.FIRST,
         when=_is_flatten_in_need,
         says="Barracuda before 2.3 leaves a Flatten out, and what reads it gets the axes before it",
         fix="write a Reshape to [-1, 1, 1, C] in its place; --for {profile} does, or write the .onnx",
@@ -83,7 +83,7 @@ _ROWS = (
     ),
     LayerRow(
         consumers=frozenset({"1.0.8", "1.9.1"}),
-        outcome=Outcome.FIRST,
+        outcome=PlayOutcome.FIRST,
         when=_is_reshape_of_memory,
         says="in a file with one input Barracuda 1.x looks at shapes before it knows the memories':"
         " a Reshape of one fails",

@@ -28,7 +28,7 @@ from export_model.converters.consumers.mlagents.names import (
 )
 from export_model.converters.consumers.unity import forms
 from export_model.converters.consumers.unity.consumers import CONSUMERS, Engine
-from export_model.converters.consumers.unity.scene import Port, Scene
+from export_model.converters.consumers.unity.scene import Scene, ScenePort
 from export_model.signatures.roles import MEMORY_SIZE
 
 #: Every observation that one of the agent's sensors is written into; every input but those of one number.
@@ -42,7 +42,7 @@ DISCRETE_ACTIONS = (DISCRETE, DETERMINISTIC + DISCRETE)
 _ACTIONS = (*CONTINUOUS_ACTIONS, *DISCRETE_ACTIONS, ACTION)
 
 
-class Outcome(StrEnum):
+class PlayOutcome(StrEnum):
     """What comes of playing a model, the worst first."""
 
     DIES = "the process dies"
@@ -63,15 +63,15 @@ class Row(Struct, frozen=True):
 
     of: tuple[str, ...]
     form: str
-    outcome: Outcome
-    when: Callable[[Port, Scene], bool]
+    outcome: PlayOutcome
+    when: Callable[[ScenePort, Scene], bool]
     says: str
     fix: str
     evidence: str = ""
     exception: str = ""
 
 
-class Player(Struct, frozen=True):
+class ReleasePlayer(Struct, frozen=True):
     """The player of one release. ``absent`` is what it throws where an output that it fetches is not there.
 
     ``played`` says whether this very release was run, or its code read, or that of another release run in its place.
@@ -103,7 +103,7 @@ _MEMORY = (
     Row(
         of=(RECURRENT_IN,),
         form=f"{MEMORY_SIZE} 0",
-        outcome=Outcome.WRONG,
+        outcome=PlayOutcome.WRONG,
         when=lambda port, scene: scene.model.memory_size == 0,
         says=f"{MEMORY_SIZE} is 0, so that no player fetches {RECURRENT_OUT}: {_NEVER}",
         fix=f"set {MEMORY_SIZE} to {{size}}, the length of {RECURRENT_IN}; --for {{profile}} does",
@@ -112,7 +112,7 @@ _MEMORY = (
     Row(
         of=(RECURRENT_IN,),
         form=f"{MEMORY_SIZE} of another length",
-        outcome=Outcome.WARNS,
+        outcome=PlayOutcome.WARNS,
         when=lambda port, scene: scene.model.memory_size not in (0, port.size),
         says=f"{MEMORY_SIZE} says {{memory_size}} and {RECURRENT_IN} has {{size}} numbers: players go by the latter",
         fix=f"set {MEMORY_SIZE} to {{size}}",
@@ -122,7 +122,7 @@ _MEMORY = (
 _NARROW_OUTPUT = Row(
     of=_ACTIONS,
     form="fewer columns than the agent has actions",
-    outcome=Outcome.WRONG,
+    outcome=PlayOutcome.WRONG,
     when=forms.gives_too_few,
     says="{name} has {size} columns and the agent {wanted}: the rest stays 0",
     fix="make the constant, the output and the agent agree; --for {profile} does",
@@ -131,7 +131,7 @@ _NARROW_OUTPUT = Row(
 _WIDE_OUTPUT = Row(
     of=_ACTIONS,
     form="more columns than the agent has actions",
-    outcome=Outcome.FIRST,
+    outcome=PlayOutcome.FIRST,
     when=forms.gives_too_many,
     says="{name} has {size} columns and the agent {wanted}",
     fix="make the constant, the output and the agent agree; --for {profile} does",
@@ -142,7 +142,7 @@ _NO_MASKS = "{name} has {size} columns, and the agent's branches together {wante
 _MASKS_WIDTH = Row(
     of=(MASKS,),
     form="another number of columns",
-    outcome=Outcome.WARNS,
+    outcome=PlayOutcome.WARNS,
     when=forms.masks_of_another_size,
     says=_NO_MASKS,
     fix=f"a mask has one column per action of each branch; {_PROFILE}",
@@ -152,7 +152,7 @@ _SENTIS_INPUTS = (
     Row(
         of=(OBSERVATION,),
         form="fewer axes than the sensor: [N, 12] for a BufferSensor of 3x4",
-        outcome=Outcome.DIES,
+        outcome=PlayOutcome.DIES,
         when=lambda port, scene: forms.lacks_axes(port),
         says="{name} is {shape}, and a sensor of {sensor} is written by {axes} axes: numbers land outside of the "
         "tensor",
@@ -162,7 +162,7 @@ _SENTIS_INPUTS = (
     Row(
         of=(OBSERVATION,),
         form="numbers outside of the last axes: [N, 4, 1, 1] for a vector",
-        outcome=Outcome.WRONG,
+        outcome=PlayOutcome.WRONG,
         when=lambda port, scene: forms.outside_last(port, len(port.sensor)),
         says="{name} is {shape}: with more than one agent their observations are written over each other",
         fix="declare {name} as {declare}, with a Reshape behind it",
@@ -171,7 +171,7 @@ _SENTIS_INPUTS = (
     Row(
         of=(OBSERVATION,),
         form="narrower than the sensor",
-        outcome=Outcome.WARNS,
+        outcome=PlayOutcome.WARNS,
         when=lambda port, scene: port.size < forms.sensor_size(port),
         says="{name} holds {size} numbers and the sensor gives {wanted}: what is too much is written behind the "
         "agent's row, for the last agent behind the tensor",
@@ -181,7 +181,7 @@ _SENTIS_INPUTS = (
     Row(
         of=(MASKS,),
         form="numbers outside of the last axis: [N, K, 1, 1]",
-        outcome=Outcome.WRONG,
+        outcome=PlayOutcome.WRONG,
         when=lambda port, scene: forms.outside_last(port, 1),
         says="{name} is {shape}: with more than one agent their masks are written over each other (read, not run)",
         fix="declare {name} as [N, {size}]",
@@ -190,7 +190,7 @@ _SENTIS_INPUTS = (
     Row(
         of=(PREVIOUS,),
         form="float32",
-        outcome=Outcome.FIRST,
+        outcome=PlayOutcome.FIRST,
         when=lambda port, scene: bool(scene.brain.branches),
         says="{name} is written as integers into a tensor of floats: it cannot be used in this release",
         fix="carry the drawn action in the memory; --for {profile} does",
@@ -200,7 +200,7 @@ _SENTIS_INPUTS = (
     Row(
         of=(SEQUENCE, BATCH),
         form="float32",
-        outcome=Outcome.FIRST,
+        outcome=PlayOutcome.FIRST,
         when=lambda port, scene: True,
         says="{name} is written as an integer into a tensor of floats: it cannot be used in this release",
         fix="make it a constant, or take it from the shape of an observation; --for {profile} does",
@@ -210,7 +210,7 @@ _SENTIS_INPUTS = (
     Row(
         of=(RECURRENT_IN,),
         form="[N, M]",
-        outcome=Outcome.WRONG,
+        outcome=PlayOutcome.WRONG,
         when=lambda port, scene: len(port.lengths) < 2,
         says=f"{{name}} is {{shape}}: {_NEVER}",
         fix=f"declare {RECURRENT_IN} and {RECURRENT_OUT} as [N, 1, {{size}}]; --for {{profile}} does",
@@ -219,7 +219,7 @@ _SENTIS_INPUTS = (
     Row(
         of=(RECURRENT_IN,),
         form="[N, L, M] with several rows",
-        outcome=Outcome.WRONG,
+        outcome=PlayOutcome.WRONG,
         when=lambda port, scene: forms.outside_last(port, 1),
         says="{name} is {shape}: a player keeps the last axis alone (read, not run)",
         fix=f"join the rows: declare {RECURRENT_IN} and {RECURRENT_OUT} as [N, 1, {{size}}]; --for {{profile}} does",
@@ -228,7 +228,7 @@ _SENTIS_INPUTS = (
     Row(
         of=(ANY,),
         form="a fixed batch",
-        outcome=Outcome.FIRST,
+        outcome=PlayOutcome.FIRST,
         when=lambda port, scene: bool(port.dims) and (port.dims or (None,))[0] is not None,
         says="{name} is declared for {batch} agents: with any other number deciding at once the player throws",
         fix="leave the first length free; --names canonical and every --for do",
@@ -241,7 +241,7 @@ _SENTIS_OUTPUTS = (
     Row(
         of=CONTINUOUS_ACTIONS,
         form="integers",
-        outcome=Outcome.FIRST,
+        outcome=PlayOutcome.FIRST,
         when=lambda port, scene: port.whole,
         says="{name} is given out as integers, and read as floats",
         fix="cast it to float32",
@@ -251,7 +251,7 @@ _SENTIS_OUTPUTS = (
     Row(
         of=DISCRETE_ACTIONS,
         form="floats",
-        outcome=Outcome.FIRST,
+        outcome=PlayOutcome.FIRST,
         when=lambda port, scene: not port.whole and port.dims is not None,
         says="{name} is given out as floats, and read as integers",
         fix="cast it to int64",
@@ -261,7 +261,7 @@ _SENTIS_OUTPUTS = (
     Row(
         of=(RECURRENT_OUT,),
         form="integers",
-        outcome=Outcome.FIRST,
+        outcome=PlayOutcome.FIRST,
         when=lambda port, scene: port.whole,
         says="{name} is given out as integers, and read as floats",
         fix="cast it to float32",
@@ -271,7 +271,7 @@ _SENTIS_OUTPUTS = (
     Row(
         of=(RECURRENT_OUT,),
         form="[N, M]",
-        outcome=Outcome.WRONG,
+        outcome=PlayOutcome.WRONG,
         when=lambda port, scene: port.dims is not None and len(port.dims) < 3,
         says=f"{{name}} is {{shape}}: {_NEVER}",
         fix="give out {name} as [N, 1, {size}]; --for {profile} does",
@@ -280,7 +280,7 @@ _SENTIS_OUTPUTS = (
     Row(
         of=_ACTIONS,
         form="one axis: [N x A]",
-        outcome=Outcome.WRONG,
+        outcome=PlayOutcome.WRONG,
         when=lambda port, scene: port.dims is not None and len(port.dims) < 2,
         says="{name} has one axis: every action is 0",
         fix="give out {name} as [N, {wanted}]; --for {profile} does",
@@ -289,7 +289,7 @@ _SENTIS_OUTPUTS = (
     Row(
         of=CONTINUOUS_ACTIONS,
         form="numbers outside of the last axis: [N, A, 1, 1]",
-        outcome=Outcome.WRONG,
+        outcome=PlayOutcome.WRONG,
         when=lambda port, scene: port.dims is not None and forms.outside_last(port, 1),
         says="{name} is {shape}: with more than one agent their actions are mixed",
         fix="give out {name} as [N, {wanted}]; --for {profile} does",
@@ -298,7 +298,7 @@ _SENTIS_OUTPUTS = (
     Row(
         of=DISCRETE_ACTIONS,
         form="numbers outside of the last axis: [N, B, 1, 1]",
-        outcome=Outcome.WARNS,
+        outcome=PlayOutcome.WARNS,
         when=lambda port, scene: port.dims is not None and forms.outside_last(port, 1),
         says="{name} is {shape}: it was seen to work where all agents do the same; continuous actions so given are "
         "mixed",
@@ -314,7 +314,7 @@ _BARRACUDA_OBSERVATIONS = (
     Row(
         of=(OBSERVATION,),
         form="less room than the sensor needs",
-        outcome=Outcome.FIRST,
+        outcome=PlayOutcome.FIRST,
         when=forms.written_outside,
         says="{name} holds {shape}, and a sensor of {sensor} is written beyond it",
         fix="set the sensor to what the file was trained with, and see how the importer lays out its input",
@@ -324,7 +324,7 @@ _BARRACUDA_OBSERVATIONS = (
     Row(
         of=(OBSERVATION,),
         form="a picture of other lengths",
-        outcome=Outcome.WRONG,
+        outcome=PlayOutcome.WRONG,
         when=forms.turned_picture,
         says="{name} is laid out as {shape}, and a picture of {sensor} is written into it: rows and columns are mixed "
         "(read, not run)",
@@ -333,7 +333,7 @@ _BARRACUDA_OBSERVATIONS = (
     Row(
         of=(OBSERVATION,),
         form="entities read as the file declares them, [N, E, F], or of a file whose pictures are channels last",
-        outcome=Outcome.WRONG,
+        outcome=PlayOutcome.WRONG,
         when=forms.misreads_entities,
         says="{name} is {shape}, which Barracuda lays out {entities}",
         fix="put Transpose (0, 2, 1) and Reshape [-1, {sensor_lengths}] right behind the input; --for {profile} does",
@@ -344,7 +344,7 @@ _BARRACUDA_MASKS = (
     Row(
         of=(MASKS,),
         form="[N, 1, K]",
-        outcome=Outcome.WRONG,
+        outcome=PlayOutcome.WRONG,
         when=lambda port, scene: forms.off_channels(port),
         says=f"{_LAID_OUT}: only the first action's mask arrives",
         fix=f"declare {{name}} as [N, {{size}}]; {_PROFILE}",
@@ -355,7 +355,7 @@ _BARRACUDA_MASKS = (
 _PREVIOUS_ACTIONS = Row(
     of=(PREVIOUS,),
     form="more columns than branches",
-    outcome=Outcome.FIRST,
+    outcome=PlayOutcome.FIRST,
     when=lambda port, scene: 0 < len(scene.brain.branches) < port.size,
     says="{name} has {size} columns, and the agent fewer branches",
     fix="give the agent {size} discrete branches",
@@ -369,7 +369,7 @@ _BARRACUDA_INPUTS = (
     Row(
         of=(RECURRENT_IN,),
         form="[1, N, M]",
-        outcome=Outcome.FIRST,
+        outcome=PlayOutcome.FIRST,
         when=lambda port, scene: port.dims is not None and len(port.dims) == 3 and None in port.dims[1:2],
         says="{name} is {shape}: the batch is the second axis, and the player throws with more than one agent",
         fix="declare it as [N, 1, M]; --for {profile} does",
@@ -379,7 +379,7 @@ _BARRACUDA_INPUTS = (
     Row(
         of=(RECURRENT_IN,),
         form="[N, M]",
-        outcome=Outcome.WRONG,
+        outcome=PlayOutcome.WRONG,
         when=lambda port, scene: port.view is not None and port.view.channels > 1,
         says="{name} is {shape}: only the first number of the memory is kept",
         fix=f"declare {RECURRENT_IN} and {RECURRENT_OUT} as [N, 1, {{size}}]; --for {{profile}} does",
@@ -391,7 +391,7 @@ _BARRACUDA_ACTIONS = (
     Row(
         of=_ACTIONS,
         form="one axis, or columns on another axis than the second: [N, 1, A]",
-        outcome=Outcome.WRONG,
+        outcome=PlayOutcome.WRONG,
         when=forms.given_off_channels,
         says="{name} is {shape}: of each agent only the first action arrives",
         fix="give out {name} as [N, {wanted}]; --for {profile} does",
@@ -404,7 +404,7 @@ _BARRACUDA_OUTPUTS = (
     Row(
         of=(RECURRENT_OUT,),
         form="[N, M]",
-        outcome=Outcome.WRONG,
+        outcome=PlayOutcome.WRONG,
         when=lambda port, scene: port.dims is not None and len(port.dims) < 3,
         says="{name} is {shape}: only the first number of the memory is kept",
         fix="give out {name} as [N, 1, {size}]; --for {profile} does",
@@ -419,7 +419,7 @@ _EARLIER_INPUTS = (
     Row(
         of=(RECURRENT_IN,),
         form="a plain input",
-        outcome=Outcome.WRONG,
+        outcome=PlayOutcome.WRONG,
         when=lambda port, scene: True,
         says=f"nobody fetches {RECURRENT_OUT} before ML-Agents 2.0: {_NEVER} (read, not run)",
         fix="write a .nn, whose memories Barracuda keeps itself: --for {profile} --to nn",
@@ -427,11 +427,11 @@ _EARLIER_INPUTS = (
 )
 _ABSENT = "KeyNotFoundException: The given key '{name}' was not present in the dictionary."
 
-PLAYERS: Mapping[str, Player] = {
+PLAYERS: Mapping[str, ReleasePlayer] = {
     player.name: player
     for player in (
         *(
-            Player(
+            ReleasePlayer(
                 release.name,
                 _SENTIS_INPUTS,
                 _SENTIS_OUTPUTS,
@@ -441,9 +441,9 @@ PLAYERS: Mapping[str, Player] = {
             for release in CONSUMERS.values()
             if release.engine is Engine.SENTIS
         ),
-        Player("R20", _BARRACUDA_INPUTS, _BARRACUDA_OUTPUTS, _ABSENT, "run"),
-        Player("2.0.1", _BARRACUDA_INPUTS, _BARRACUDA_OUTPUTS, _ABSENT, "run"),
-        Player("1.9.1", _EARLIER_INPUTS, _BARRACUDA_ACTIONS, _ABSENT, "run in part, mostly read"),
-        Player("1.0.8", _EARLIER_INPUTS, _BARRACUDA_ACTIONS, _ABSENT, "run with .nn, mostly read"),
+        ReleasePlayer("R20", _BARRACUDA_INPUTS, _BARRACUDA_OUTPUTS, _ABSENT, "run"),
+        ReleasePlayer("2.0.1", _BARRACUDA_INPUTS, _BARRACUDA_OUTPUTS, _ABSENT, "run"),
+        ReleasePlayer("1.9.1", _EARLIER_INPUTS, _BARRACUDA_ACTIONS, _ABSENT, "run in part, mostly read"),
+        ReleasePlayer("1.0.8", _EARLIER_INPUTS, _BARRACUDA_ACTIONS, _ABSENT, "run with .nn, mostly read"),
     )
 }

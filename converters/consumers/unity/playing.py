@@ -20,25 +20,25 @@ from export_model.converters.consumers.unity.players import (
     ONE_NUMBER,
     PLAYERS,
     UNKNOWN,
-    Outcome,
-    Player,
+    PlayOutcome,
+    ReleasePlayer,
     Row,
 )
 from export_model.converters.consumers.unity.rules import culture_key
-from export_model.converters.consumers.unity.scene import Port, Scene
+from export_model.converters.consumers.unity.scene import Scene, ScenePort
 
 #: Operators that compute nothing.
 _MOVES = frozenset({"Cast", "Concat", "Flatten", "Identity", "Reshape", "Slice", "Squeeze", "Unsqueeze"})
 _ABSENT = "mem_out_missing, cont_missing_drawn, disc_missing_drawn"
 
 
-class Played(Struct, frozen=True):
+class PlayEvent(Struct, frozen=True):
     """One thing that comes of playing a model.
 
     ``exception`` is Unity's text where it throws, ``evidence`` the small models that it was measured with.
     """
 
-    outcome: Outcome
+    outcome: PlayOutcome
     message: str
     where: str
     fix: str
@@ -48,7 +48,7 @@ class Played(Struct, frozen=True):
     @property
     def fails(self) -> bool:
         """Whether the model cannot be played so."""
-        return self.outcome is not Outcome.WARNS
+        return self.outcome is not PlayOutcome.WARNS
 
     def to_dict(self) -> dict[str, Any]:
         """For ``--json``."""
@@ -62,13 +62,13 @@ class Played(Struct, frozen=True):
         }
 
 
-def throws(outcome: Outcome, thrown: Thrown) -> Played:
+def throws(outcome: PlayOutcome, thrown: Thrown) -> PlayEvent:
     """An exception that stands in the verdict already, as what comes of playing."""
     said = f"{thrown.exception}: {thrown.message}" if thrown.worded else thrown.exception
-    return Played(outcome, thrown.message, thrown.where, thrown.fix, said)
+    return PlayEvent(outcome, thrown.message, thrown.where, thrown.fix, said)
 
 
-def play(scene: Scene) -> tuple[Played, ...]:
+def play(scene: Scene) -> tuple[PlayEvent, ...]:
     """What a player trips over, the worst first; nothing where it plays the model rightly."""
     player = PLAYERS[scene.consumer.name]
     found = [
@@ -79,16 +79,16 @@ def play(scene: Scene) -> tuple[Played, ...]:
         *_kept_action(scene),
         *_layers(scene),
     ]
-    order = list(Outcome)
+    order = list(PlayOutcome)
     return tuple(sorted(dict.fromkeys(found), key=lambda played: order.index(played.outcome)))
 
 
-def _inputs(scene: Scene, player: Player) -> Iterator[Played]:
+def _inputs(scene: Scene, player: ReleasePlayer) -> Iterator[PlayEvent]:
     known = {*scene.sensor_shapes, *FED, *scene.model.memories}
     for port in sorted(scene.inputs(), key=lambda p: culture_key(p.name)):
         if port.name not in known:
-            yield Played(
-                Outcome.FIRST,
+            yield PlayEvent(
+                PlayOutcome.FIRST,
                 f"no sensor of the agent and nothing in ML-Agents feeds {port.name}",
                 f"input {port.name}",
                 "give the agent the sensor it stands for, rename it, or fix it with --set NAME=VALUE",
@@ -102,16 +102,18 @@ def _inputs(scene: Scene, player: Player) -> Iterator[Played]:
         yield from _matching_rows(player.inputs, groups, port, scene, "input")
 
 
-def _outputs(scene: Scene, player: Player) -> Iterator[Played]:
+def _outputs(scene: Scene, player: ReleasePlayer) -> Iterator[PlayEvent]:
     for port in scene.outputs():
         yield from _matching_rows(player.outputs, {port.name}, port, scene, "output")
 
 
-def _matching_rows(rows: Sequence[Row], groups: set[str], port: Port, scene: Scene, kind: str) -> Iterator[Played]:
+def _matching_rows(
+    rows: Sequence[Row], groups: set[str], port: ScenePort, scene: Scene, kind: str
+) -> Iterator[PlayEvent]:
     for row in rows:
         if groups.intersection(row.of) and row.when(port, scene):
             words = fields(port, scene)
-            yield Played(
+            yield PlayEvent(
                 row.outcome,
                 row.says.format_map(words),
                 f"{kind} {port.name}",
@@ -121,7 +123,7 @@ def _matching_rows(rows: Sequence[Row], groups: set[str], port: Port, scene: Sce
             )
 
 
-def _absent(scene: Scene, player: Player) -> Iterator[Played]:
+def _absent(scene: Scene, player: ReleasePlayer) -> Iterator[PlayEvent]:
     for name in scene.fetched:
         if name in scene.model.outputs or (name == RECURRENT_OUT and scene.model.memories):
             continue
@@ -131,12 +133,12 @@ def _absent(scene: Scene, player: Player) -> Iterator[Played]:
             text += f": before ML-Agents 1.7 no player knows {CONTINUOUS} and {DISCRETE}"
             fix = "play it in ML-Agents 1.7 or later (--to nn without --for writes for 1.7 to 1.9)"
             evidence = "cases/hybrid_nn_ml-agents-1.0.8"
-        yield Played(Outcome.FIRST, text, f"output {name}", fix, player.absent.format(name=name), evidence)
+        yield PlayEvent(PlayOutcome.FIRST, text, f"output {name}", fix, player.absent.format(name=name), evidence)
 
 
-def _layers(scene: Scene) -> Iterator[Played]:
+def _layers(scene: Scene) -> Iterator[PlayEvent]:
     for row, layer in () if scene.nn is None else trips(scene.nn, scene.consumer.name):
-        yield Played(
+        yield PlayEvent(
             row.outcome,
             row.says,
             f"layer {layer.name}",
@@ -146,12 +148,12 @@ def _layers(scene: Scene) -> Iterator[Played]:
         )
 
 
-def _kinds(scene: Scene) -> Iterator[Played]:
+def _kinds(scene: Scene) -> Iterator[PlayEvent]:
     acts = [name for name in scene.fetched if name != RECURRENT_OUT]
     brain = scene.brain
     if not acts and (brain.continuous or brain.branches):
-        yield Played(
-            Outcome.NOTHING,
+        yield PlayEvent(
+            PlayOutcome.NOTHING,
             "no output with actions is fetched: no action comes out, and the agent keeps an empty one",
             "outputs",
             f"give the file the actions of this mode, and their shape's constant; --for {scene.consumer.profile} does",
@@ -163,15 +165,15 @@ def _kinds(scene: Scene) -> Iterator[Played]:
         return
     for kind, wanted in ((CONTINUOUS, brain.continuous > 0), (DISCRETE, bool(brain.branches))):
         if acts and wanted and not any(name.endswith(kind) for name in acts):
-            yield Played(
-                Outcome.WRONG,
+            yield PlayEvent(
+                PlayOutcome.WRONG,
                 f"no {kind} are fetched, and the agent has some: they stay 0 (read, not run)",
                 f"output {kind}",
                 f"give the file {kind} for this mode, or take them off the agent",
             )
 
 
-def _kept_action(scene: Scene) -> Iterator[Played]:
+def _kept_action(scene: Scene) -> Iterator[PlayEvent]:
     """A memory with the last action in it, where that is another than the one that is played."""
     if scene.file is None or RECURRENT_OUT not in scene.fetched:
         return
@@ -179,8 +181,8 @@ def _kept_action(scene: Scene) -> Iterator[Played]:
     for kind in (CONTINUOUS, DISCRETE):
         plain = f"{DETERMINISTIC}{kind}"
         if plain in scene.fetched and kept & _parts(scene.file, kind) and not kept & _parts(scene.file, plain):
-            yield Played(
-                Outcome.WARNS, DRAWN_KEPT, f"output {RECURRENT_OUT}", "leave it off, or export with --deterministic"
+            yield PlayEvent(
+                PlayOutcome.WARNS, DRAWN_KEPT, f"output {RECURRENT_OUT}", "leave it off, or export with --deterministic"
             )
 
 

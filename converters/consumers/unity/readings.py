@@ -19,9 +19,9 @@ from export_model.converters.consumers.unity.constructs import (
     MOST_AXES,
     OUTPUT,
     Construct,
-    Model,
+    ConstructModel,
     Operand,
-    Source,
+    OperandSource,
 )
 from export_model.converters.consumers.unity.importers import (
     BARRACUDA,
@@ -47,7 +47,7 @@ class Reading(StrEnum):
     LOST = "lost"  # an output of it cannot be fetched
 
 
-class Rule(Struct, frozen=True):
+class Form(Struct, frozen=True):
     """A form of some operators and what it comes to in some importers."""
 
     ops: tuple[str, ...]
@@ -63,10 +63,10 @@ class Misreading(Struct, frozen=True):
 
     importer: str
     construct: Construct
-    rule: Rule
+    rule: Form
 
 
-def misreadings(model: Model, importers: Sequence[str] = EVERY) -> Iterator[Misreading]:
+def misreadings(model: ConstructModel, importers: Sequence[str] = EVERY) -> Iterator[Misreading]:
     """All that ``importers`` do not read rightly, in the order of the model's nodes."""
     for construct in model:
         for rule in _BY_OP.get(construct.op, ()):
@@ -85,15 +85,15 @@ def misread_ops(importers: Sequence[str]) -> frozenset[str]:
 
 def _is_computed(index: int) -> Callable[[Construct], bool]:
     """There is an operand at ``index``, and it is no constant."""
-    return lambda c: c.operand(index).source in (Source.COMPUTED, Source.INPUT, Source.COPIED)
+    return lambda c: c.operand(index).source in (OperandSource.COMPUTED, OperandSource.INPUT, OperandSource.COPIED)
 
 
 def _is_given(index: int) -> Callable[[Construct], bool]:
-    return lambda c: c.operand(index).source is not Source.ABSENT
+    return lambda c: c.operand(index).source is not OperandSource.ABSENT
 
 
 def _missing(index: int) -> Callable[[Construct], bool]:
-    return lambda c: c.operand(index).source is Source.ABSENT
+    return lambda c: c.operand(index).source is OperandSource.ABSENT
 
 
 def _all(*conditions: Callable[[Construct], bool]) -> Callable[[Construct], bool]:
@@ -115,7 +115,7 @@ def _axes(c: Construct) -> list[int]:
 
 
 def _without_axes(c: Construct) -> bool:
-    return c.attribute("axes") is None and c.operand(1).source is Source.ABSENT
+    return c.attribute("axes") is None and c.operand(1).source is OperandSource.ABSENT
 
 
 def _deep_last_axis(c: Construct) -> bool:
@@ -125,12 +125,12 @@ def _deep_last_axis(c: Construct) -> bool:
 
 
 def _over_image(c: Construct) -> bool:
-    return c.op.startswith("Reduce") and c.operand(0).source is Source.INPUT and _axes(c) == [1, 2]
+    return c.op.startswith("Reduce") and c.operand(0).source is OperandSource.INPUT and _axes(c) == [1, 2]
 
 
 def _bias_is_row(c: Construct) -> bool:
     shape = c.operand(2).shape
-    return c.operand(2).source is Source.CONSTANT and shape is not None and len(shape) > 1
+    return c.operand(2).source is OperandSource.CONSTANT and shape is not None and len(shape) > 1
 
 
 def _bias_of_one(c: Construct) -> bool:
@@ -220,7 +220,7 @@ def _joined_after_flattening(c: Construct) -> bool:
 
 
 def _of_image_input(c: Construct) -> bool:
-    return c.attribute("perm") == [0, 3, 1, 2] and c.operand(0).source is Source.INPUT
+    return c.attribute("perm") == [0, 3, 1, 2] and c.operand(0).source is OperandSource.INPUT
 
 
 def _groups(c: Construct) -> bool:
@@ -232,7 +232,7 @@ def _groups(c: Construct) -> bool:
 def _row_first(c: Construct) -> bool:
     """Arithmetic with a constant row [1, n] of the same width as the other operand."""
     for row, other in ((c.operand(0), c.operand(1)), (c.operand(1), c.operand(0))):
-        if row.source is not Source.CONSTANT or row.shape is None or other.shape is None:
+        if row.source is not OperandSource.CONSTANT or row.shape is None or other.shape is None:
             continue
         if len(row.shape) == len(other.shape) == 2 and row.shape[0] == 1 != row.shape[1] == other.shape[1]:
             return True
@@ -240,14 +240,16 @@ def _row_first(c: Construct) -> bool:
 
 
 def _grows(c: Construct) -> bool:
-    shapes = [o.shape for o in c.operands if o.source is not Source.CONSTANT]
+    shapes = [o.shape for o in c.operands if o.source is not OperandSource.CONSTANT]
     ranks = {len(s) for s in shapes if s is not None}
     return len(shapes) == 2 and None not in shapes and len(ranks) == 2 and min(ranks) > 1
 
 
 def _last_of_three(c: Construct) -> bool:
     """A constant vector added to the last axis of a tensor of rank 3."""
-    other = next((o for o in c.operands if o.source is Source.CONSTANT and _rank(o) == 1 and o.shape != (1,)), None)
+    other = next(
+        (o for o in c.operands if o.source is OperandSource.CONSTANT and _rank(o) == 1 and o.shape != (1,)), None
+    )
     return other is not None and any(_rank(o) == 3 for o in c.operands)
 
 
@@ -257,7 +259,7 @@ def _uneven(*names: str) -> Callable[[Construct], bool]:
 
 
 def _constant_first(c: Construct) -> bool:
-    return c.operand(0).source is Source.CONSTANT and c.operand(1).source is not Source.CONSTANT
+    return c.operand(0).source is OperandSource.CONSTANT and c.operand(1).source is not OperandSource.CONSTANT
 
 
 def _negative(index: int) -> Callable[[Construct], bool]:
@@ -316,129 +318,129 @@ def _slopes(c: Construct) -> bool:
 # ------------------------------------------------------------------ rules
 
 
-def _rules() -> Iterator[Rule]:
+def _rules() -> Iterator[Form]:
     wrong, refused, fails = Reading.WRONG, Reading.REFUSED, Reading.FAILS
     old = FROM_1_4_TO_2_3
     sums = ("ReduceSum", "ReduceMean")
     reductions = (*sums, "ReduceMax", "ReduceMin", "ReduceProd")
-    yield Rule(
+    yield Form(
         reductions, wrong, old, "axes as an operand are not read: it reduces the batch", "ReduceSum_10", _is_given(1)
     )
-    yield Rule(reductions, refused, FIRST, "axes as an operand are not read", "ReduceSum_10", _is_given(1))
-    yield Rule(reductions, wrong, LATER, "without axes it reduces the batch alone", "ReduceSum_05", _without_axes)
-    yield Rule(reductions, refused, FIRST, "without axes", "ReduceSum_05", _without_axes)
-    yield Rule(reductions, fails, FIRST, "over the last axis of rank 3 or 4", "ReduceSum_06", _deep_last_axis)
-    yield Rule(reductions, refused, FIRST, "over height and width of an NHWC input", "input_12", _over_image)
+    yield Form(reductions, refused, FIRST, "axes as an operand are not read", "ReduceSum_10", _is_given(1))
+    yield Form(reductions, wrong, LATER, "without axes it reduces the batch alone", "ReduceSum_05", _without_axes)
+    yield Form(reductions, refused, FIRST, "without axes", "ReduceSum_05", _without_axes)
+    yield Form(reductions, fails, FIRST, "over the last axis of rank 3 or 4", "ReduceSum_06", _deep_last_axis)
+    yield Form(reductions, refused, FIRST, "over height and width of an NHWC input", "input_12", _over_image)
 
     never = (
         "ReduceL2 ReduceSumSquare ReduceLogSumExp GreaterOrEqual GatherElements LayerNormalization GRU Range Softsign "
         "ThresholdedRelu Mod HardSwish Gelu Einsum CumSum If Loop Scan"
     )
-    yield Rule(tuple(never.split()), refused, BARRACUDA, "Barracuda has no such operator", "Einsum_01")
+    yield Form(tuple(never.split()), refused, BARRACUDA, "Barracuda has no such operator", "Einsum_01")
     since_14 = "Split ArgMax ArgMin Where LessOrEqual Tile Shape ConstantOfShape Sign Softplus"
-    yield Rule(tuple(since_14.split()), refused, FIRST, "Barracuda has it from 1.4 on", "ArgMax_01")
-    yield Rule(("Erf", "HardSigmoid", "ScatterND"), refused, BEFORE_2_3, "Barracuda has it from 2.3.1 on", "Erf_01")
-    yield Rule(("GRU",), refused, SENTIS, "Sentis has no such operator", "GRU_01")
-    yield Rule(("If", "Loop", "Scan"), Reading.LOST, SENTIS, "Sentis leaves it out", "If_01")
+    yield Form(tuple(since_14.split()), refused, FIRST, "Barracuda has it from 1.4 on", "ArgMax_01")
+    yield Form(("Erf", "HardSigmoid", "ScatterND"), refused, BEFORE_2_3, "Barracuda has it from 2.3.1 on", "Erf_01")
+    yield Form(("GRU",), refused, SENTIS, "Sentis has no such operator", "GRU_01")
+    yield Form(("If", "Loop", "Scan"), Reading.LOST, SENTIS, "Sentis leaves it out", "If_01")
 
     sizes = "the sizes are read from the attribute alone"
-    yield Rule(("Split",), refused, LATER, sizes, "Split_04", lambda c: c.attribute("split") is None)
+    yield Form(("Split",), refused, LATER, sizes, "Split_04", lambda c: c.attribute("split") is None)
     axes = "axes as an operand are read from 2.3.1 on"
-    yield Rule(("Squeeze", "Unsqueeze"), refused, BEFORE_2_3, axes, "Squeeze_04", _is_given(1))
-    yield Rule(("Squeeze",), wrong, LATER, "two leading axes at once, batch above 1", "LSTM_01", _dropped_batch)
-    yield Rule(("Reshape",), fails, LATER, "a computed shape, batch above 1", "Reshape_08", _is_computed(1))
+    yield Form(("Squeeze", "Unsqueeze"), refused, BEFORE_2_3, axes, "Squeeze_04", _is_given(1))
+    yield Form(("Squeeze",), wrong, LATER, "two leading axes at once, batch above 1", "LSTM_01", _dropped_batch)
+    yield Form(("Reshape",), fails, LATER, "a computed shape, batch above 1", "Reshape_08", _is_computed(1))
     flat = "the elements come in another order"
-    yield Rule(("Reshape", "Flatten"), wrong, FIRST, flat, "Reshape_01", _flat_in_first)
-    yield Rule(("Concat",), refused, FIRST, "a flattened image cannot be joined", "Conv_21", _joined_after_flattening)
-    yield Rule(("Flatten",), wrong, FROM_1_4_TO_2_0, f"of a convolution: {flat}", "Conv_18", _flattened_conv)
+    yield Form(("Reshape", "Flatten"), wrong, FIRST, flat, "Reshape_01", _flat_in_first)
+    yield Form(("Concat",), refused, FIRST, "a flattened image cannot be joined", "Conv_21", _joined_after_flattening)
+    yield Form(("Flatten",), wrong, FROM_1_4_TO_2_0, f"of a convolution: {flat}", "Conv_18", _flattened_conv)
 
-    yield Rule(("Gemm",), wrong, BARRACUDA, "alpha and beta are not read", "Gemm_04", _is_scaled)
-    yield Rule(
+    yield Form(("Gemm",), wrong, BARRACUDA, "alpha and beta are not read", "Gemm_04", _is_scaled)
+    yield Form(
         ("Gemm",), refused, FROM_2_3, "without C", "Gemm_06", _all(_missing(2), lambda c: c.operand(1).is_constant)
     )
-    yield Rule(("Gemm",), fails, BARRACUDA, "C of one element is not spread", "Gemm_07", _bias_of_one)
-    yield Rule(("Gemm",), wrong, BARRACUDA, "C of shape [1, n] is dropped", "Gemm_08", _bias_is_row)
-    yield Rule(("Gemm",), wrong, BARRACUDA, "a computed C is dropped", "Gemm_12", _is_computed(2))
-    yield Rule(("Gemm",), refused, FROM_1_4_TO_2_0, "B is computed", "Gemm_10", _is_computed(1))
-    matrix = _all(_is_computed(1), lambda c: c.operand(1).source is not Source.COPIED)
-    yield Rule(("Gemm",), refused, FIRST, "B is computed", "Gemm_10", matrix)
+    yield Form(("Gemm",), fails, BARRACUDA, "C of one element is not spread", "Gemm_07", _bias_of_one)
+    yield Form(("Gemm",), wrong, BARRACUDA, "C of shape [1, n] is dropped", "Gemm_08", _bias_is_row)
+    yield Form(("Gemm",), wrong, BARRACUDA, "a computed C is dropped", "Gemm_12", _is_computed(2))
+    yield Form(("Gemm",), refused, FROM_1_4_TO_2_0, "B is computed", "Gemm_10", _is_computed(1))
+    matrix = _all(_is_computed(1), lambda c: c.operand(1).source is not OperandSource.COPIED)
+    yield Form(("Gemm",), refused, FIRST, "B is computed", "Gemm_10", matrix)
     dropped = _all(_is_computed(1), _is_given(2))
-    yield Rule(("Gemm",), wrong, FROM_2_3, "C is dropped where B is computed", "Gemm_10", dropped)
+    yield Form(("Gemm",), wrong, FROM_2_3, "C is dropped where B is computed", "Gemm_10", dropped)
     constant = _all(_many_dims, lambda c: c.operand(1).is_constant)
-    yield Rule(("MatMul",), refused, FIRST, "of rank 3 by a constant", "MatMul_05", constant)
+    yield Form(("MatMul",), refused, FIRST, "of rank 3 by a constant", "MatMul_05", constant)
     computed = _all(_many_dims, lambda c: not c.operand(1).is_constant)
-    yield Rule(("MatMul",), fails, FIRST, "of rank 3 and above", "MatMul_06", computed)
+    yield Form(("MatMul",), fails, FIRST, "of rank 3 and above", "MatMul_06", computed)
 
     last = _all(lambda c: bool(c.attribute("select_last_index", 0)))
-    yield Rule(("ArgMax", "ArgMin"), wrong, LATER, "select_last_index is not read", "ArgMax_06", last)
+    yield Form(("ArgMax", "ArgMin"), wrong, LATER, "select_last_index is not read", "ArgMax_06", last)
     truncated = _all(_cast_to("i"), lambda c: _fraction(c.operand(0), c))
-    yield Rule(("Cast",), wrong, BARRACUDA, "to an integer: fractions are kept", "Cast_01", truncated)
-    yield Rule(("Cast",), wrong, EVERY, "to bool: the value is kept", "Cast_03", _not_zero_or_one)
+    yield Form(("Cast",), wrong, BARRACUDA, "to an integer: fractions are kept", "Cast_01", truncated)
+    yield Form(("Cast",), wrong, EVERY, "to bool: the value is kept", "Cast_03", _not_zero_or_one)
     bounds = _all(lambda c: _is_computed(1)(c) or _is_computed(2)(c))
-    yield Rule(("Clip",), wrong, LATER, "a computed bound is not read", "Clip_07", bounds)
-    yield Rule(("Clip",), refused, FIRST, "a computed bound is not read", "Clip_07", bounds)
+    yield Form(("Clip",), wrong, LATER, "a computed bound is not read", "Clip_07", bounds)
+    yield Form(("Clip",), refused, FIRST, "a computed bound is not read", "Clip_07", bounds)
 
-    yield Rule(("Slice",), wrong, BARRACUDA, "it does not go backwards", "Slice_13", _negative(4))
-    yield Rule(("Slice",), wrong, FIRST, "an end beyond every index is misread", "Slice_10", _endless)
+    yield Form(("Slice",), wrong, BARRACUDA, "it does not go backwards", "Slice_13", _negative(4))
+    yield Form(("Slice",), wrong, FIRST, "an end beyond every index is misread", "Slice_10", _endless)
     two = _all(lambda c: _rank(c.operand(0)) == 3 and len(_axes(c)) > 1)
-    yield Rule(("Slice",), wrong, FIRST, "two axes of rank 3", "Slice_15", two)
+    yield Form(("Slice",), wrong, FIRST, "two axes of rank 3", "Slice_15", two)
     deep = _all(_deep_last_axis, lambda c: _rank(c.operand(0)) == 3 and len(_axes(c)) == 1)
-    yield Rule(("Slice",), fails, FIRST, "the last axis of rank 3", "Slice_16", deep)
-    yield Rule(("Gather",), fails, BARRACUDA, "a negative index", "Gather_04", _negative(1))
-    table = _all(lambda c: c.operand(0).source is Source.CONSTANT)
-    yield Rule(("Gather",), refused, FIRST, "rows of a constant table", "Gather_05", table)
+    yield Form(("Slice",), fails, FIRST, "the last axis of rank 3", "Slice_16", deep)
+    yield Form(("Gather",), fails, BARRACUDA, "a negative index", "Gather_04", _negative(1))
+    table = _all(lambda c: c.operand(0).source is OperandSource.CONSTANT)
+    yield Form(("Gather",), refused, FIRST, "rows of a constant table", "Gather_05", table)
     unnamed = _all(lambda c: c.attribute("perm") is None and _rank(c.operand(0)) == 2 and c.operand(0).value is None)
     wide = "of more than four axes (seen in 3.0.0; no other was tried)"
-    yield Rule(("Reshape", "Transpose"), refused, BARRACUDA, wide, "r4, entity_attention", lambda c: c.axes > MOST_AXES)
-    yield Rule(("Transpose",), wrong, LATER, "of rank 2 without perm, batch above 1", "Transpose_02", unnamed)
+    yield Form(("Reshape", "Transpose"), refused, BARRACUDA, wide, "r4, entity_attention", lambda c: c.axes > MOST_AXES)
+    yield Form(("Transpose",), wrong, LATER, "of rank 2 without perm, batch above 1", "Transpose_02", unnamed)
     swapped = _all(lambda c: c.attribute("perm") == [1, 0, 2])
-    yield Rule(("Transpose",), wrong, FIRST, "of rank 3, batch above 1", "Transpose_04", swapped)
+    yield Form(("Transpose",), wrong, FIRST, "of rank 3, batch above 1", "Transpose_04", swapped)
     shown = _all(_of_image_input, lambda c: c.given_out)
-    yield Rule(("Transpose",), wrong, FIRST, "of an NHWC input", "Transpose_06", shown)
+    yield Form(("Transpose",), wrong, FIRST, "of an NHWC input", "Transpose_06", shown)
     hidden = _all(_of_image_input, lambda c: not c.given_out)
-    yield Rule(("Transpose",), fails, FIRST, "of an NHWC input", "Conv_15", hidden)
+    yield Form(("Transpose",), fails, FIRST, "of an NHWC input", "Conv_15", hidden)
     unknown = "Barracuda 1.4 and later"
     says = f"to a constant shape, batch above 1; {unknown} do"
-    yield Rule(("Expand",), fails, FIRST, says, "Expand_01", lambda c: c.operand(1).is_constant)
-    yield Rule(("Shape",), wrong, LATER, "as an output: the batch is that of the import", "Shape_01", _reaches_output)
-    yield Rule(("TopK",), fails, FIRST, f"{unknown} run it", "TopK_01")
-    yield Rule(("ScatterND",), wrong, FROM_2_3, "other values", "ScatterND_01")
+    yield Form(("Expand",), fails, FIRST, says, "Expand_01", lambda c: c.operand(1).is_constant)
+    yield Form(("Shape",), wrong, LATER, "as an output: the batch is that of the import", "Shape_01", _reaches_output)
+    yield Form(("TopK",), fails, FIRST, f"{unknown} run it", "TopK_01")
+    yield Form(("ScatterND",), wrong, FROM_2_3, "other values", "ScatterND_01")
 
-    yield Rule(("Conv",), fails, BARRACUDA, "groups of several channels", "Conv_11", _groups)
-    yield Rule(("Conv",), refused, BARRACUDA, "computed weights", "Conv_14", _is_computed(1))
+    yield Form(("Conv",), fails, BARRACUDA, "groups of several channels", "Conv_11", _groups)
+    yield Form(("Conv",), refused, BARRACUDA, "computed weights", "Conv_14", _is_computed(1))
     uneven_by = "lengths that differ by axis: heights are taken for widths"
     played = "cases/rank2_barracuda-3"
-    yield Rule(("Conv",), fails, BARRACUDA, f"strides of {uneven_by}", played, _uneven("strides"))
+    yield Form(("Conv",), fails, BARRACUDA, f"strides of {uneven_by}", played, _uneven("strides"))
     uneven = _uneven("strides", "kernel_shape")
-    yield Rule(("MaxPool", "AveragePool"), fails, BARRACUDA, f"{uneven_by} (read, a Conv was run)", played, uneven)
+    yield Form(("MaxPool", "AveragePool"), fails, BARRACUDA, f"{uneven_by} (read, a Conv was run)", played, uneven)
     ceiling = _all(lambda c: bool(c.attribute("ceil_mode", 0)))
-    yield Rule(("MaxPool", "AveragePool"), wrong, EVERY, "ceil_mode is not read", "MaxPool_04", ceiling)
+    yield Form(("MaxPool", "AveragePool"), wrong, EVERY, "ceil_mode is not read", "MaxPool_04", ceiling)
     padded = _all(lambda c: bool(c.attribute("count_include_pad", 0)))
-    yield Rule(("AveragePool",), wrong, EVERY, "count_include_pad is not read", "AveragePool_03", padded)
-    yield Rule(("Pad",), wrong, FIRST, "pads as an operand are not read", "Pad_02", _is_given(1))
-    yield Rule(("Softmax", "LogSoftmax"), wrong, EVERY, "read as of opset 13", "Softmax_08", _old_softmax)
+    yield Form(("AveragePool",), wrong, EVERY, "count_include_pad is not read", "AveragePool_03", padded)
+    yield Form(("Pad",), wrong, FIRST, "pads as an operand are not read", "Pad_02", _is_given(1))
+    yield Form(("Softmax", "LogSoftmax"), wrong, EVERY, "read as of opset 13", "Softmax_08", _old_softmax)
     soft = _all(lambda c: _rank(c.operand(0)) > 2, lambda c: not _old_softmax(c))
-    yield Rule(("Softmax", "LogSoftmax"), wrong, FIRST, "of rank 3", "Softmax_06", soft)
-    yield Rule(("PRelu",), wrong, LATER, "a slope for each channel of rank 4", "PRelu_02", _slopes)
-    yield Rule(("PRelu",), fails, FIRST, "a slope for each channel of rank 4", "PRelu_02", _slopes)
-    yield Rule(("LSTM",), refused, BARRACUDA, "without B", "LSTM_03", _missing(3))
+    yield Form(("Softmax", "LogSoftmax"), wrong, FIRST, "of rank 3", "Softmax_06", soft)
+    yield Form(("PRelu",), wrong, LATER, "a slope for each channel of rank 4", "PRelu_02", _slopes)
+    yield Form(("PRelu",), fails, FIRST, "a slope for each channel of rank 4", "PRelu_02", _slopes)
+    yield Form(("LSTM",), refused, BARRACUDA, "without B", "LSTM_03", _missing(3))
     both = _all(lambda c: c.attribute("direction", b"forward") != b"forward")
-    yield Rule(("LSTM",), refused, BARRACUDA, "only forward", "LSTM_06", both)
-    yield Rule(("LSTM",), fails, FIRST, "its memory is not found", "LSTM_01", _all(_is_given(3), _is_given(5)))
-    yield Rule(("LSTM",), refused, FIRST, "without a first state", "LSTM_02", _missing(5))
+    yield Form(("LSTM",), refused, BARRACUDA, "only forward", "LSTM_06", both)
+    yield Form(("LSTM",), fails, FIRST, "its memory is not found", "LSTM_01", _all(_is_given(3), _is_given(5)))
+    yield Form(("LSTM",), refused, FIRST, "without a first state", "LSTM_02", _missing(5))
 
-    yield Rule(("Sub", "Div"), wrong, FIRST, "a constant first operand: they are swapped", "Sub_01", _constant_first)
+    yield Form(("Sub", "Div"), wrong, FIRST, "a constant first operand: they are swapped", "Sub_01", _constant_first)
     four = ("Add", "Sub", "Mul", "Div")
-    yield Rule(four, wrong, FIRST, "a constant of shape [1, n]: another shape", "Add_02", _row_first)
-    yield Rule(four, wrong, FIRST, "operands of different rank: another shape", "Add_10", _grows)
-    yield Rule(four, fails, FIRST, "a vector over the last axis of rank 3", "Add_06", _last_of_three)
-    yield Rule(("Round",), wrong, FIRST, "halves are not rounded to even", "Round_01")
+    yield Form(four, wrong, FIRST, "a constant of shape [1, n]: another shape", "Add_02", _row_first)
+    yield Form(four, wrong, FIRST, "operands of different rank: another shape", "Add_10", _grows)
+    yield Form(four, fails, FIRST, "a vector over the last axis of rank 3", "Add_06", _last_of_three)
+    yield Form(("Round",), wrong, FIRST, "halves are not rounded to even", "Round_01")
     unheld = "value_float and value_floats"
-    yield Rule(("Constant",), refused, BEFORE_2_4, unheld, "Constant_02", lambda c: "value" not in c.attributes)
+    yield Form(("Constant",), refused, BEFORE_2_4, unheld, "Constant_02", lambda c: "value" not in c.attributes)
     through = "an input that is an output"
-    yield Rule((OUTPUT,), refused, SENTIS, through, "output_02", lambda c: c.operand(0).source is Source.INPUT)
+    yield Form((OUTPUT,), refused, SENTIS, through, "output_02", lambda c: c.operand(0).source is OperandSource.INPUT)
     again = "an Identity of an output that a Reshape makes"
-    yield Rule((OUTPUT,), refused, FROM_2_4, again, "beside the 352", _identity_of_reshaped)
+    yield Form((OUTPUT,), refused, FROM_2_4, again, "beside the 352", _identity_of_reshaped)
 
 
 RULES = tuple(_rules())

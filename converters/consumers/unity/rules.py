@@ -22,7 +22,7 @@ from export_model.converters.consumers.mlagents.names import (
     VISUAL,
 )
 from export_model.converters.consumers.unity.consumers import Checks, Consumer
-from export_model.converters.consumers.unity.findings import Finding, Severity, warning
+from export_model.converters.consumers.unity.findings import Complaint, Severity, warning
 from export_model.converters.consumers.unity.model import (
     FIRST_VERSION,
     LAST_VERSION,
@@ -49,10 +49,10 @@ _TOLERATED = frozenset({EPSILON, MASKS, SEQUENCE, RECURRENT_IN})
 #: Signs in the order of the invariant culture.
 _SIGNS = "_-,;:!?.'\"()[]{}@*/\\&#%`^+<=>|~$"
 
-Findings = Iterator[Finding]
+Findings = Iterator[Complaint]
 
 
-def check(model: CheckedModel, brain: Brain, deterministic: bool, consumer: Consumer) -> list[Finding]:
+def check(model: CheckedModel, brain: Brain, deterministic: bool, consumer: Consumer) -> list[Complaint]:
     """The list that the Inspector shows. Raises UnityThrows where the check itself ends in an exception."""
     return (
         [] if consumer.checks is None else list(_checks(model, brain, deterministic, consumer.profile, consumer.checks))
@@ -86,7 +86,7 @@ def _checks(model: CheckedModel, brain: Brain, deterministic: bool, profile: str
     yield from _actions(model, brain)
 
 
-def version_error(model: CheckedModel, profile: str) -> Finding | None:
+def version_error(model: CheckedModel, profile: str) -> Complaint | None:
     """The one finding that also stops a player: the version is not loaded, or its memory is not.
 
     Raises UnityThrows where the version or the memory's size is read and not there.
@@ -113,13 +113,13 @@ def version_error(model: CheckedModel, profile: str) -> Finding | None:
     if text is None:
         return None
     fix = f"no retraining is needed: --for {profile} writes version {LAST_VERSION}, its memory included"
-    return Finding(Severity.ERROR, text, f"constant {VERSION_NUMBER}", fix)
+    return Complaint(Severity.ERROR, text, f"constant {VERSION_NUMBER}", fix)
 
 
 # ------------------------------------------------------------------ what must be there before anything is looked at
 
 
-def _another_version(version: int, profile: str) -> Finding:
+def _another_version(version: int, profile: str) -> Complaint:
     """What ML-Agents 1.x says, which knows version 2 alone."""
     text = (
         "Model was trained with a newer version of the trainer than is supported. Either retrain with an older "
@@ -131,7 +131,9 @@ def _another_version(version: int, profile: str) -> Finding:
             f"Version of the trainer the model was trained with ({version}) is not compatible with the Brain's version "
             f"({FIRST_VERSION})."
         )
-    return Finding(Severity.ERROR, text, f"constant {VERSION_NUMBER}", f"no retraining is needed: use --for {profile}")
+    return Complaint(
+        Severity.ERROR, text, f"constant {VERSION_NUMBER}", f"no retraining is needed: use --for {profile}"
+    )
 
 
 def _missing_constants(model: CheckedModel, deterministic: bool, profile: str, known: Checks) -> Findings:
@@ -238,7 +240,7 @@ def _inputs_of_version_2(model: CheckedModel, brain: Brain, deterministic: bool)
         yield _no_masks("")
 
 
-def _noobservation(index: int, sensor: Sensor) -> Finding:
+def _noobservation(index: int, sensor: Sensor) -> Complaint:
     return warning(
         f"The model does not contain an Observation Placeholder Input for sensor component {index} ({sensor.kind}).",
         f"input {observation(index)}",
@@ -247,11 +249,11 @@ def _noobservation(index: int, sensor: Sensor) -> Finding:
     )
 
 
-def _no_recurrent_input(fix: str) -> Finding:
+def _no_recurrent_input(fix: str) -> Complaint:
     return warning("The model does not contain a Recurrent Input Node but has memory_size.", "inputs", fix)
 
 
-def _no_masks(profile: str) -> Finding:
+def _no_masks(profile: str) -> Complaint:
     return warning(
         "The model does not contain an Action Mask but is using Discrete Control.",
         f"input {MASKS}",
@@ -262,7 +264,7 @@ def _no_masks(profile: str) -> Finding:
 
 # ------------------------------------------------------------------ shapes of inputs
 
-Tester = Callable[[InputView], Finding | None]
+Tester = Callable[[InputView], Complaint | None]
 
 
 def _shapes(model: CheckedModel, brain: Brain, testers: dict[str, Tester], spared: str | None = None) -> Findings:
@@ -299,7 +301,7 @@ def _tester(sensor: Sensor) -> Tester:
     return lambda view: test(view, sensor)
 
 
-def _row(view: InputView, sensor: Sensor) -> Finding | None:
+def _row(view: InputView, sensor: Sensor) -> Complaint | None:
     """A vector, or a list of entities."""
     held = [view.channels, view.width]
     if list(sensor.shape) == held[: len(sensor.shape)]:
@@ -311,7 +313,7 @@ def _row(view: InputView, sensor: Sensor) -> Finding | None:
     return _mismatch("An Observation", list(sensor.shape), held, view, sensor)
 
 
-def _camera(view: InputView, sensor: Sensor) -> Finding | None:
+def _camera(view: InputView, sensor: Sensor) -> Complaint | None:
     channels, height, width = sensor.shape
     if (channels, height, width) == (view.channels, view.height, view.width):
         return None
@@ -319,7 +321,7 @@ def _camera(view: InputView, sensor: Sensor) -> Finding | None:
     return _mismatch("The visual Observation", [width, height, channels], held, view, sensor)
 
 
-def _mismatch(what: str, sensed: list[int], held: list[int], view: InputView, sensor: Sensor) -> Finding:
+def _mismatch(what: str, sensed: list[int], held: list[int], view: InputView, sensor: Sensor) -> Complaint:
     return warning(
         f"{what} of the model does not match. Received TensorProxy of shape [?x{'x'.join(map(str, sensed))}] "
         f"but was expecting [?x{'x'.join(map(str, held))}] for the {sensor.name} Sensor.",
@@ -329,7 +331,7 @@ def _mismatch(what: str, sensed: list[int], held: list[int], view: InputView, se
     )
 
 
-def _vector(view: InputView, brain: Brain) -> Finding | None:
+def _vector(view: InputView, brain: Brain) -> Complaint | None:
     sizes = [s.shape[0] for s in brain.sensors if len(s.shape) == 1]
     if sum(sizes) == view.last:
         return None
@@ -343,7 +345,7 @@ def _vector(view: InputView, brain: Brain) -> Finding | None:
     )
 
 
-def _previous_action(view: InputView, brain: Brain) -> Finding | None:
+def _previous_action(view: InputView, brain: Brain) -> Complaint | None:
     if len(brain.branches) == view.last:
         return None
     return warning(
@@ -376,7 +378,7 @@ def _actions(model: CheckedModel, brain: Brain) -> Findings:
             yield from _each_branch(brain.branches, held)
 
 
-def _branches(expected: str, held: str, what: str) -> Finding:
+def _branches(expected: str, held: str, what: str) -> Complaint:
     return warning(
         f"Discrete Action Size of the model does not match. The BrainParameters expect {expected} "
         f"but the model contains {held}.",

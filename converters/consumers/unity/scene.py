@@ -18,7 +18,7 @@ from export_model.converters.formats.barracuda.format import NnModel
 _INTEGERS = frozenset({2, 3, 4, 5, 6, 7, 9, 12, 13})  # TensorProto.DataType
 
 
-class Port(Struct, frozen=True):
+class ScenePort(Struct, frozen=True):
     """An input or an output.
 
     ``dims`` has the batch first and None for a free length; it is None where nobody says it (outputs of a ``.nn``).
@@ -59,25 +59,25 @@ class Scene(Struct, frozen=True):
     file: OnnxFile | None = None
     nn: NnModel | None = None
 
-    def inputs(self) -> Iterator[Port]:
+    def inputs(self) -> Iterator[ScenePort]:
         """The inputs that the player fills."""
         sensed = self.sensor_shapes
         declared = {} if self.file is None else {self.imported_name(i.name): i for i in self.file.inputs}
         for index, view in enumerate(self.model.inputs):
             given = declared.get(view.name)
             dims, whole = (None, False) if given is None else (given.dims or (), not given.is_float)
-            yield Port(view.name, index, dims, whole, view, sensed.get(view.name, ()))
+            yield ScenePort(view.name, index, dims, whole, view, sensed.get(view.name, ()))
 
-    def outputs(self) -> Iterator[Port]:
+    def outputs(self) -> Iterator[ScenePort]:
         """The outputs that the player fetches and the file has."""
         if self.file is None:
-            yield from (Port(name, 0, None) for name in self.fetched if name in self.model.outputs)
+            yield from (ScenePort(name, 0, None) for name in self.fetched if name in self.model.outputs)
             return
         shapes = {self.imported_name(name): shape for name, shape in self.file.shapes.items()}
         for value in self.file.model.graph.output:
             name = self.imported_name(value.name)
             if name in self.fetched:
-                yield Port(name, 0, shapes.get(name), value.type.tensor_type.elem_type in _INTEGERS)
+                yield ScenePort(name, 0, shapes.get(name), value.type.tensor_type.elem_type in _INTEGERS)
 
     def imported_name(self, name: str) -> str:
         """A name as the importer keeps it."""

@@ -20,7 +20,7 @@ PER_MODEL_BYTE = 32
 PER_FED_BYTE = 64
 
 
-class Memory:
+class ChildMemory:
     """The bound of one child that is ready."""
 
     def __init__(self, pid: int) -> None:

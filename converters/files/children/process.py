@@ -28,7 +28,7 @@ from export_model.converters.files.children.frames import (
     read_frame,
     write_frame,
 )
-from export_model.converters.files.children.memory_limits import Memory
+from export_model.converters.files.children.memory_limits import ChildMemory
 from export_model.converters.files.children.python import confined_command
 from export_model.converters.files.children.time_limits import processor_time, time_limit
 from export_model.converters.files.folders import OwnFolder, link_model, live_folders, scratch_folder, size_of
@@ -96,7 +96,7 @@ class RuntimeProcess(AbstractContextManager["RuntimeProcess"]):
         #: when it was asked
         self._asked = 0.0
         self._closed = threading.Event()
-        self._memory: Memory | None = None
+        self._memory: ChildMemory | None = None
         self._loaded = 0
         self._timed_out = timed_out
         #: the model that has not answered yet, the processor time at which the process is stopped, how much that gives
@@ -155,7 +155,7 @@ class RuntimeProcess(AbstractContextManager["RuntimeProcess"]):
             ) from error
         self.version = str(answer["version"])
         if self._process is not None and self.confined:
-            self._memory = Memory(self._process.pid)
+            self._memory = ChildMemory(self._process.pid)
         return self.version
 
     def load(self, path: str, *, answered: bool = False, **options: Any) -> LoadedModel:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from export_model.converters.formats.barracuda.layer_builder import LayerBuilder, Value
+from export_model.converters.formats.barracuda.layer_builder import LayerBuilder, NnValue
 from export_model.converters.graph.builder import Builder
 from export_model.converters.graph.nn import activations as nn
 from export_model.converters.graph.nn import reduction, trigonometry
@@ -50,7 +50,7 @@ _ROWS: Mapping[int, Callable[[Builder, str], str]] = {
 }
 
 
-def activate(b: LayerBuilder, number: int, x: Value, *, axis: int = -1, fused: bool = False) -> Value:
+def activate(b: LayerBuilder, number: int, x: NnValue, *, axis: int = -1, fused: bool = False) -> NnValue:
     """``number`` applied to ``x``; the parameters are the current layer's, or the defaults where it is fused."""
     if number == Activation.NONE:
         return x
@@ -62,30 +62,30 @@ def activate(b: LayerBuilder, number: int, x: Value, *, axis: int = -1, fused: b
     if number in _ROWS:
         return _over_rows(b, Activation(number), x, axis)
     if number == Activation.ELU:
-        return Value(nn.elu(b, x.reference, 1.0 if fused else b.layer.alpha), x.shape)
+        return NnValue(nn.elu(b, x.reference, 1.0 if fused else b.layer.alpha), x.shape)
     if number in _ONE_OP:
-        return Value(b.add(_ONE_OP[number], [x.reference]), x.shape)
+        return NnValue(b.add(_ONE_OP[number], [x.reference]), x.shape)
     if number in _FUNCTIONS:
-        return Value(_FUNCTIONS[number](b, x.reference), x.shape)
+        return NnValue(_FUNCTIONS[number](b, x.reference), x.shape)
     if number in _PARAMETRIC:
-        return Value(_PARAMETRIC[number](b, x.reference, b.layer.alpha, b.layer.beta), x.shape)
+        return NnValue(_PARAMETRIC[number](b, x.reference, b.layer.alpha, b.layer.beta), x.shape)
     raise b.unsupported_error(f"its activation is {activation_label(number)}", "no formula of it is known")
 
 
-def prelu(b: LayerBuilder, x: Value, slope: Value) -> Value:
+def prelu(b: LayerBuilder, x: NnValue, slope: NnValue) -> NnValue:
     """max(0, x) + slope·min(0, x)."""
     (data, factor), shape = b.operands([x, slope])
     if shape != x.shape:
         raise b.damaged_error(
             f"slopes of shape {list(slope.shape)} for {list(x.shape)}", "there are more slopes than numbers"
         )
-    return Value(nn.prelu(b, data, factor), shape)
+    return NnValue(nn.prelu(b, data, factor), shape)
 
 
 # ------------------------------------------------------------------ over rows
 
 
-def _over_rows(b: LayerBuilder, kind: Activation, x: Value, axis: int) -> Value:
+def _over_rows(b: LayerBuilder, kind: Activation, x: NnValue, axis: int) -> NnValue:
     """Softmax and its kin, over the flattened row up to version 16, along an axis (8-D order) from 18 on."""
     along_channels = axis in (-1, 7)
     if x.rank == 4 and b.version > 16:
@@ -94,7 +94,7 @@ def _over_rows(b: LayerBuilder, kind: Activation, x: Value, axis: int) -> Value:
                 f"{activation_label(kind)} of a tensor of shape {list(x.shape)}, axis {axis}",
                 "Barracuda 1.x took the whole row, later versions an axis; only an axis of channels is known for sure",
             )
-        return Value(_ROWS[kind](b, x.reference), x.shape)
+        return NnValue(_ROWS[kind](b, x.reference), x.shape)
     if b.version > 16 and not along_channels:
         raise b.unsupported_error(f"{activation_label(kind)} along axis {axis}", "that axis is not the channels'")
     return b.rows(_ROWS[kind](b, b.as_matrix(x)), x.shape[0], x.size)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from export_model.converters.formats.barracuda.layer_builder import LayerBuilder, Shape, Value, with_length
+from export_model.converters.formats.barracuda.layer_builder import LayerBuilder, NnValue, Shape, with_length
 from export_model.converters.formats.barracuda.shaping import axis_of
 from export_model.converters.graph.nn import reduction
 from export_model.converters.graph.ops.barracuda.vocabulary import C, LayerType, N
@@ -39,24 +39,24 @@ _REDUCED: Mapping[int, reduction.Reduction] = {
 }
 
 
-def fold_inputs(b: LayerBuilder, args: Sequence[Value]) -> Value:
+def fold_inputs(b: LayerBuilder, args: Sequence[NnValue]) -> NnValue:
     """The inputs combined from left to right: ((a − b) − c) …; the mean divides the sum by their number."""
     kind, total = LayerType(b.layer.type), args[0]
     for value in args[1:]:
         operands, shape = b.operands([total, value])
-        total = Value(b.add(_FOLDED[kind], operands), shape)
+        total = NnValue(b.add(_FOLDED[kind], operands), shape)
     if kind is LayerType.MEAN and len(args) > 1:
-        total = Value(b.add("Mul", [total.reference, b.floats(1 / len(args), "share")]), total.shape)
+        total = NnValue(b.add("Mul", [total.reference, b.floats(1 / len(args), "share")]), total.shape)
     return total
 
 
-def compare_operands(b: LayerBuilder, args: Sequence[Value]) -> Value:
+def compare_operands(b: LayerBuilder, args: Sequence[NnValue]) -> NnValue:
     """1 where the comparison holds, else 0."""
     operands, shape = b.operands(args)
     return _as_float(b, b.add(_COMPARISONS[b.layer.type], operands), shape)
 
 
-def logical(b: LayerBuilder, args: Sequence[Value]) -> Value:
+def logical(b: LayerBuilder, args: Sequence[NnValue]) -> NnValue:
     """And, or, not, exclusive or of truths: a number is true unless it is 0."""
     operands, shape = b.operands(args)
     truths = [_truth(b, r) for r in operands]
@@ -70,26 +70,26 @@ def logical(b: LayerBuilder, args: Sequence[Value]) -> Value:
     return _as_float(b, result, shape)
 
 
-def where(b: LayerBuilder, args: Sequence[Value]) -> Value:
+def where(b: LayerBuilder, args: Sequence[NnValue]) -> NnValue:
     """The second input where the first is not 0, else the third."""
     (condition, *choices), shape = b.operands(args)
-    return Value(b.add("SelectV2", [_truth(b, condition), *choices]), shape)
+    return NnValue(b.add("SelectV2", [_truth(b, condition), *choices]), shape)
 
 
-def sign(b: LayerBuilder, args: Sequence[Value]) -> Value:
+def sign(b: LayerBuilder, args: Sequence[NnValue]) -> NnValue:
     """−1, 0 or 1."""
-    return Value(b.add("Sign", [args[0].reference]), args[0].shape)
+    return NnValue(b.add("Sign", [args[0].reference]), args[0].shape)
 
 
 def _truth(b: LayerBuilder, reference: str) -> str:
     return b.add("NotEqual", [reference, b.floats(0, "zero")])
 
 
-def _as_float(b: LayerBuilder, truth: str, shape: Shape) -> Value:
-    return Value(b.add("Cast", [truth], DstT=FLOAT32), shape)
+def _as_float(b: LayerBuilder, truth: str, shape: Shape) -> NnValue:
+    return NnValue(b.add("Cast", [truth], DstT=FLOAT32), shape)
 
 
-def reduce_axis(b: LayerBuilder, args: Sequence[Value]) -> Value:
+def reduce_axis(b: LayerBuilder, args: Sequence[NnValue]) -> NnValue:
     """One number per row along an axis, which stays with length 1. A second input names the axis and is ignored."""
     x = args[0]
     axis = axis_of(b, b.layer.axis)

@@ -12,7 +12,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from export_model.converters.formats.barracuda.dense import add_bias
-from export_model.converters.formats.barracuda.layer_builder import LayerBuilder, Value
+from export_model.converters.formats.barracuda.layer_builder import LayerBuilder, NnValue
 from export_model.converters.graph.nn import convolution as nn
 from export_model.converters.graph.nn import normalisation, pooling
 from export_model.converters.graph.ops.barracuda.vocabulary import LayerType
@@ -24,7 +24,7 @@ _LOWEST = float(np.finfo(np.float32).min)
 _TINY = float(np.finfo(np.float32).tiny)
 
 
-def _window(b: LayerBuilder, x: Value, size: tuple[int, int], stride: Sequence[int]) -> nn.Window:
+def _window(b: LayerBuilder, x: NnValue, size: tuple[int, int], stride: Sequence[int]) -> nn.Window:
     """The window of the current layer over an image; ``size`` is (height, width). Raises GraphError."""
     if len(stride) != 2 or min(stride) < 1 or min(size) < 1:
         raise b.damaged_error(f"a window of {list(size)} with strides {list(stride)}", "both have two numbers above 0")
@@ -52,7 +52,7 @@ def _window(b: LayerBuilder, x: Value, size: tuple[int, int], stride: Sequence[i
 # ------------------------------------------------------------------ convolutions
 
 
-def conv2d(b: LayerBuilder, args: Sequence[Value]) -> Value:
+def conv2d(b: LayerBuilder, args: Sequence[NnValue]) -> NnValue:
     """K [height, width, in, out] over an image, plus a bias of out."""
     x, kernel, bias = args
     array = _kernel(b, kernel)
@@ -63,7 +63,7 @@ def conv2d(b: LayerBuilder, args: Sequence[Value]) -> Value:
     return _image_of(b, x, window, add_bias(b, product, bias), array.shape[3])
 
 
-def depthwise(b: LayerBuilder, args: Sequence[Value]) -> Value:
+def depthwise(b: LayerBuilder, args: Sequence[NnValue]) -> NnValue:
     """A kernel [height, width, 1, C] that keeps the channels apart."""
     x, kernel, bias = args
     array = _kernel(b, kernel)
@@ -76,7 +76,7 @@ def depthwise(b: LayerBuilder, args: Sequence[Value]) -> Value:
     return _image_of(b, x, window, add_bias(b, product, bias), array.shape[3])
 
 
-def conv2d_trans(b: LayerBuilder, args: Sequence[Value]) -> Value:
+def conv2d_trans(b: LayerBuilder, args: Sequence[NnValue]) -> NnValue:
     """A transposed convolution by K [height, width, in, out].
 
     ``pool`` is the output adjustment [width, height]; where it is empty, Unity takes (in + pads − kernel) mod stride.
@@ -107,31 +107,31 @@ def conv2d_trans(b: LayerBuilder, args: Sequence[Value]) -> Value:
     b.check_size(*lengths, array.shape[3])
     product = add_bias(b, nn.conv2d_transposed(b, b.as_image(x), array, window, (extra[0], extra[1])), bias)
     shape = (x.n, lengths[0], lengths[1], int(array.shape[3]))
-    return b.as_shape(product, shape) if shape[1:3] == (1, 1) else Value(product, shape)
+    return b.as_shape(product, shape) if shape[1:3] == (1, 1) else NnValue(product, shape)
 
 
-def _kernel(b: LayerBuilder, kernel: Value) -> np.ndarray:
+def _kernel(b: LayerBuilder, kernel: NnValue) -> np.ndarray:
     if kernel.constant is None:
         raise b.unsupported_error("its kernel is computed", "kernels are constants in every target")
     return kernel.constant
 
 
-def _channels(b: LayerBuilder, x: Value, kernel: Value, bias: Value) -> Exception:
+def _channels(b: LayerBuilder, x: NnValue, kernel: NnValue, bias: NnValue) -> Exception:
     return b.damaged_error(
         f"{x.c} channels, a kernel of shape {list(kernel.shape)}, a bias of {bias.size}",
         "the kernel [height, width, in, out] does not fit to them",
     )
 
 
-def _image_of(b: LayerBuilder, x: Value, window: nn.Window, reference: str, channels: int) -> Value:
+def _image_of(b: LayerBuilder, x: NnValue, window: nn.Window, reference: str, channels: int) -> NnValue:
     shape = (x.n, *window.lengths(x.shape[1:3]), channels)
-    return b.as_shape(reference, shape) if shape[1:3] == (1, 1) else Value(reference, shape)
+    return b.as_shape(reference, shape) if shape[1:3] == (1, 1) else NnValue(reference, shape)
 
 
 # ------------------------------------------------------------------ pools
 
 
-def pool(b: LayerBuilder, args: Sequence[Value]) -> Value:
+def pool(b: LayerBuilder, args: Sequence[NnValue]) -> NnValue:
     """The maximum or the mean of each window; what is padded does not count."""
     (x,) = args
     if len(b.layer.pool) != 2:
@@ -143,7 +143,7 @@ def pool(b: LayerBuilder, args: Sequence[Value]) -> Value:
     return _image_of(b, x, window, pooling.average_pool(b, image, window), x.c)
 
 
-def global_pool(b: LayerBuilder, args: Sequence[Value]) -> Value:
+def global_pool(b: LayerBuilder, args: Sequence[NnValue]) -> NnValue:
     """The maximum or the mean of all pixels, per channel: [N, 1, 1, C]."""
     (x,) = args
     if x.rank != 4:
@@ -156,7 +156,7 @@ def global_pool(b: LayerBuilder, args: Sequence[Value]) -> Value:
 # ------------------------------------------------------------------ borders and sizes
 
 
-def border(b: LayerBuilder, args: Sequence[Value]) -> Value:
+def border(b: LayerBuilder, args: Sequence[NnValue]) -> NnValue:
     """A border around the image: of ``beta``, or made of its own pixels; a negative one cuts pixels off."""
     (x,) = args
     pad = tuple(b.layer.pad)
@@ -191,7 +191,7 @@ def _mirror_index(kind: int, index: np.ndarray, length: int) -> np.ndarray:
     return np.asarray(np.clip(index, 0, last))
 
 
-def upsample(b: LayerBuilder, args: Sequence[Value]) -> Value:
+def upsample(b: LayerBuilder, args: Sequence[NnValue]) -> NnValue:
     """Every pixel ``pool`` = [width, height] times; the factors may come as a constant [N, H, W, C] instead."""
     factors: Sequence[int] = b.layer.pool
     if not factors and len(args) == 2 and args[1].constant is not None and args[1].constant.size == 4:
@@ -214,7 +214,7 @@ def upsample(b: LayerBuilder, args: Sequence[Value]) -> Value:
     return b.as_shape(data, (n, h * factors[1], w * factors[0], c))
 
 
-def normalization(b: LayerBuilder, args: Sequence[Value]) -> Value:
+def normalization(b: LayerBuilder, args: Sequence[NnValue]) -> NnValue:
     """Instance normalisation: (x − mean) / √(variance + beta)·S + B, mean and variance over each channel's pixels."""
     x, scale, bias = args
     if b.layer.axis not in (-1, 3, 7):

@@ -6,14 +6,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from export_model.converters.formats.barracuda.layer_builder import LayerBuilder, Shape, Value
+from export_model.converters.formats.barracuda.layer_builder import LayerBuilder, NnValue, Shape
 from export_model.converters.graph.nn import linear
 from export_model.converters.graph.nn.activations import scale_and_shift
 from export_model.converters.graph.ops.barracuda.vocabulary import LayerType
 from export_model.converters.graph.types import FLOAT32, INT32, INT64
 
 
-def dense(b: LayerBuilder, args: Sequence[Value]) -> Value:
+def dense(b: LayerBuilder, args: Sequence[NnValue]) -> NnValue:
     """X flattened to [N, H·W·C], times K [in, 1, 1, out], plus a bias [1, 1, 1, out]."""
     x, kernel, bias = args
     rows, columns = kernel.n, kernel.size
@@ -26,20 +26,20 @@ def dense(b: LayerBuilder, args: Sequence[Value]) -> Value:
     return b.rows(add_bias(b, product, bias), x.n, columns)
 
 
-def add_bias(b: LayerBuilder, product: str, bias: Value) -> str:
+def add_bias(b: LayerBuilder, product: str, bias: NnValue) -> str:
     """``product`` plus a bias along its last axis; the zeros that ML-Agents' converter makes up are left out."""
     if _all(bias, 0):
         return product
     return b.add("BiasAdd", [product, b.as_vector(bias)])
 
 
-def _all(value: Value, number: float) -> bool:
+def _all(value: NnValue, number: float) -> bool:
     """Whether a tensor is known to hold nothing but ``number``."""
     with np.errstate(invalid="ignore"):
         return value.constant is not None and bool(np.all(value.constant == number))
 
 
-def matmul(b: LayerBuilder, args: Sequence[Value]) -> Value:
+def matmul(b: LayerBuilder, args: Sequence[NnValue]) -> NnValue:
     """X·Y of two tensors. ``pool`` are their ranks in ONNX; empty in the old versions, which know rank 2 alone.
 
     A tensor of rank 2 is [N, C], of rank 3 (ONNX: N, C, W) is [N, 1, W, C], of rank 4 (ONNX: NCHW) is NHWC.
@@ -55,7 +55,7 @@ def matmul(b: LayerBuilder, args: Sequence[Value]) -> Value:
     return _times(b, x, y, ranks[0], ranks[1])
 
 
-def dense3(b: LayerBuilder, args: Sequence[Value]) -> Value:
+def dense3(b: LayerBuilder, args: Sequence[NnValue]) -> NnValue:
     """The product of a rank-3 X [N, 1, W, C] with K [W, 1, 1, M], over W, plus a bias of M: [N, 1, M, C]."""
     x, kernel, bias = args
     if kernel.n is None or bias.constant is None:
@@ -67,7 +67,7 @@ def dense3(b: LayerBuilder, args: Sequence[Value]) -> Value:
     return b.as_shape(b.add("Add", [b.as_image(product), column]), product.shape)
 
 
-def _times(b: LayerBuilder, x: Value, y: Value, left: int, right: int) -> Value:
+def _times(b: LayerBuilder, x: NnValue, y: NnValue, left: int, right: int) -> NnValue:
     """The product of tensors that have these ranks in ONNX: [N, C], [N, C, W] or [N, C, H, W]."""
     inner = x.size if left == 2 else x.w
     rows, columns = {2: (y.n, y.size), 3: (y.c, y.w), 4: (y.h, y.w)}[right]
@@ -82,7 +82,7 @@ def _times(b: LayerBuilder, x: Value, y: Value, left: int, right: int) -> Value:
     return b.as_shape(turned, (n, x.h, columns, x.c))
 
 
-def _onnx_order(b: LayerBuilder, x: Value, rank: int) -> str:
+def _onnx_order(b: LayerBuilder, x: NnValue, rank: int) -> str:
     """A tensor [N, H, W, C] as ONNX has it."""
     if rank == 2:
         return b.as_matrix(x)
@@ -92,7 +92,7 @@ def _onnx_order(b: LayerBuilder, x: Value, rank: int) -> str:
     return turned if rank == 4 else b.squeeze(turned, [2])
 
 
-def scale_bias(b: LayerBuilder, args: Sequence[Value]) -> Value:
+def scale_bias(b: LayerBuilder, args: Sequence[NnValue]) -> NnValue:
     """x·S + B along the channels; S of ones is what ML-Agents' converter makes of a bias alone."""
     x, scale, bias = args
     if scale.size != x.c or bias.size != x.c:
@@ -101,14 +101,14 @@ def scale_bias(b: LayerBuilder, args: Sequence[Value]) -> Value:
     if not _all(scale, 1):
         result = b.add("Mul", [result, b.as_vector(scale)])
     if x.rank == 1:
-        return Value(b.add("Add", [result, b.as_vector(bias)]), x.shape)
-    return Value(add_bias(b, result, bias), x.shape)
+        return NnValue(b.add("Add", [result, b.as_vector(bias)]), x.shape)
+    return NnValue(add_bias(b, result, bias), x.shape)
 
 
 # ------------------------------------------------------------------ chance
 
 
-def random(b: LayerBuilder, args: Sequence[Value]) -> Value:
+def random(b: LayerBuilder, args: Sequence[NnValue]) -> NnValue:
     """alpha·N(0, 1) + beta, or alpha·U(0, 1) + beta, of the shape of the input, or of ``pool``."""
     if b.layer.pool:
         shape: Shape = b.four(b.layer.pool)
@@ -129,10 +129,10 @@ def random(b: LayerBuilder, args: Sequence[Value]) -> Value:
         drawn = b.add("RandomStandardNormal", [size], origin=b.layer.name, dtype=FLOAT32)
     else:
         drawn = b.add("RandomUniform", [size], dtype=FLOAT32)
-    return Value(scale_and_shift(b, drawn, b.layer.alpha, b.layer.beta), shape)
+    return NnValue(scale_and_shift(b, drawn, b.layer.alpha, b.layer.beta), shape)
 
 
-def multinomial(b: LayerBuilder, args: Sequence[Value]) -> Value:
+def multinomial(b: LayerBuilder, args: Sequence[NnValue]) -> NnValue:
     """``pool[0]`` classes per row, drawn from the row's log-probabilities; a ``.nn`` holds them as floats."""
     (x,) = args
     if len(b.layer.pool) != 1 or b.layer.pool[0] < 1:
@@ -142,7 +142,7 @@ def multinomial(b: LayerBuilder, args: Sequence[Value]) -> Value:
     return b.rows(b.add("Cast", [drawn], DstT=FLOAT32), x.n, count, drawn)
 
 
-def one_hot(b: LayerBuilder, args: Sequence[Value]) -> Value:
+def one_hot(b: LayerBuilder, args: Sequence[NnValue]) -> NnValue:
     """A row of ``pool[0]`` numbers per index: alpha at the index, beta elsewhere.
 
     Up to version 16 [N, 1, 1, n] becomes [N, 1, n, depth]; later, ``axis`` is the rank of the indices in ONNX, and the

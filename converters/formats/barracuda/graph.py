@@ -23,7 +23,7 @@ from export_model.converters.formats.barracuda.format import (
     draws_in_model,
     four_axes,
 )
-from export_model.converters.formats.barracuda.layer_builder import MAX_ELEMENTS, LayerBuilder, Value, node_name
+from export_model.converters.formats.barracuda.layer_builder import MAX_NN_ELEMENTS, LayerBuilder, NnValue, node_name
 from export_model.converters.formats.barracuda.layers import check_bypassed, translate
 from export_model.converters.formats.barracuda.slices import upstream
 from export_model.converters.graph.nodes import Graph, NameScope, joined_name
@@ -38,14 +38,14 @@ _CLASSES = ("discrete_actions", "deterministic_discrete_actions")
 _INTEGER_ROLES = (Role.ACTION, Role.DETERMINISTIC)
 
 
-class Reading(Struct, frozen=True):
+class GraphReading(Struct, frozen=True):
     """The graph of a file, and what was noticed on the way."""
 
     graph: Graph
     notes: tuple[str, ...]
 
 
-def to_graph(model: NnModel) -> Reading:
+def to_graph(model: NnModel) -> GraphReading:
     """Translate a parsed file.
 
     Raises UnsupportedOpError or GraphError for a layer that the policy's outputs depend on; one that they do not
@@ -65,13 +65,13 @@ class _Reader:
             self.nodes[name] = names.fresh(node_name(name))
         reserved = [*self.nodes.values(), MEMORY_IN, MEMORY_OUT]
         self.builder = LayerBuilder(reserved, model.version)
-        self.values: dict[str, Value] = {}
+        self.values: dict[str, NnValue] = {}
         #: what could not be translated, and is read by nothing that is needed so far
         self.failed: dict[str, ExportModelError] = {}
         self.needed = _upstream(model, self.layers)
         self.draws = draws_in_model(model.number(VERSION_NUMBER) or 0)
 
-    def read(self) -> Reading:
+    def read(self) -> GraphReading:
         memories = {m.input for m in self.model.memories}
         for given in self.model.inputs:
             if given.name not in memories:
@@ -84,9 +84,9 @@ class _Reader:
                 self._attempt(layer.name, partial(self._layer, layer))
         self._memory_out()
         self._check_action()
-        return Reading(self.builder.graph(), tuple(self.builder.notes))
+        return GraphReading(self.builder.graph(), tuple(self.builder.notes))
 
-    def _attempt(self, name: str, make: Callable[[], Value]) -> None:
+    def _attempt(self, name: str, make: Callable[[], NnValue]) -> None:
         """Make a tensor; an error counts at once only if the policy depends on it."""
         try:
             self.values[name] = make()
@@ -113,7 +113,7 @@ class _Reader:
 
     # ------------------------------------------------------------------ inputs
 
-    def _input(self, given: NnInput) -> Value:
+    def _input(self, given: NnInput) -> NnValue:
         _, h, w, c = four_axes(given.shape, f"input {given.name!r}")
         if min(h, w, c) < 1:
             raise SignatureError(
@@ -135,10 +135,10 @@ class _Reader:
         if state:
             return self.builder.as_shape(name, shape)
         if not integer:
-            return Value(name, shape)
-        return Value(self.builder.add("Cast", [name], name="float", DstT=FLOAT32), shape, integer=name)
+            return NnValue(name, shape)
+        return NnValue(self.builder.add("Cast", [name], name="float", DstT=FLOAT32), shape, integer=name)
 
-    def _entities(self, given: NnInput, count: int, size: int) -> Value:
+    def _entities(self, given: NnInput, count: int, size: int) -> NnValue:
         """A sensor of rank 2: [N, 1, W, C] in Unity, whose first dimension is C and second W; [B, C, W] here."""
         b, name = self.builder, self.nodes[given.name]
         b.named_input(name, FLOAT32, (None, size, count), given.name)
@@ -153,10 +153,10 @@ class _Reader:
             return
         shapes = [four_axes(m.shape, f"memory {m.input!r}")[1:] for m in memories]
         sizes = [math.prod(s) for s in shapes]
-        if min(min(s) for s in shapes) < 1 or sum(sizes) > MAX_ELEMENTS:
+        if min(min(s) for s in shapes) < 1 or sum(sizes) > MAX_NN_ELEMENTS:
             raise DamagedFileError(
                 f"the memories have {sizes} elements",
-                why=f"a memory has at least one, and all together have at most {MAX_ELEMENTS}",
+                why=f"a memory has at least one, and all together have at most {MAX_NN_ELEMENTS}",
                 fix="copy or download the .nn again",
             )
         self.builder.named_input(MEMORY_IN, FLOAT32, (None, sum(sizes)), joined_name([m.input for m in memories]))
@@ -168,7 +168,7 @@ class _Reader:
                 part = self.builder.slice(MEMORY_IN, 1, start, start + size)
                 part = self.builder.finish(part, begun, name, memory.input)
             start += size
-            value = Value(part, (None, 1, 1, size))
+            value = NnValue(part, (None, 1, 1, size))
             self.values[memory.input] = value if (h, w) == (1, 1) else self.builder.as_shape(part, (None, h, w, c))
 
     def _memory_out(self) -> None:
@@ -192,7 +192,7 @@ class _Reader:
 
     # ------------------------------------------------------------------ layers
 
-    def _value(self, name: str, reader: str) -> Value:
+    def _value(self, name: str, reader: str) -> NnValue:
         if name in self.failed:
             raise self.failed[name]
         if name not in self.values:
@@ -212,7 +212,7 @@ class _Reader:
             if len(layer.datasets) == 1:
                 self.values[layer.name] = self.values[dataset.name]
 
-    def _layer(self, layer: Layer) -> Value:
+    def _layer(self, layer: Layer) -> NnValue:
         b, name = self.builder, self.nodes[layer.name]
         if self.model.from_python:
             check_bypassed(layer)

@@ -24,7 +24,7 @@ from export_model.signatures.errors import GraphError, UnsupportedOpError
 Shape = tuple[int | None, int, int, int]
 
 #: Elements of one row of a tensor; a picture of 1024 by 1024 with 16 channels has as many.
-MAX_ELEMENTS = 1 << 24
+MAX_NN_ELEMENTS = 1 << 24
 _UNFIT = re.compile(r"[^A-Za-z0-9_.\-/]")
 
 
@@ -40,7 +40,7 @@ def with_length(shape: Shape, axis: int, length: int) -> Shape:
     return length if axis == 0 else shape[0], rest[0], rest[1], rest[2]
 
 
-class Value(Struct, frozen=True):
+class NnValue(Struct, frozen=True):
     """A tensor: where it is, and its shape in the ``.nn``.
 
     ``constant`` are its numbers [N, H, W, C] where they are known; ``integer`` is the same tensor before a ``.nn``
@@ -107,14 +107,14 @@ class LayerBuilder(Builder):
 
     # ------------------------------------------------------------------ nodes
 
-    def dataset(self, name: str, array: npt.NDArray[np.float32], node: str | None = None) -> Value:
+    def dataset(self, name: str, array: npt.NDArray[np.float32], node: str | None = None) -> NnValue:
         """A dataset [N, H, W, C] as a Const (``node``: its reserved name), in the form that its shape asks for."""
         n, h, w, c = array.shape
         form = array if (h, w) != (1, 1) else array.reshape(c) if n == 1 else array.reshape(n, c)
         made = Node(
             node or self.names.fresh(node_name(name)), "Const", value=form, origin=None if node is None else name
         )
-        return Value(self.append(made), (n, h, w, c), array)
+        return NnValue(self.append(made), (n, h, w, c), array)
 
     def finish(self, value: str, started: int, name: str, origin: str | tuple[str, ...]) -> str:
         """Call the node behind ``value`` ``name``; one from before ``started``, or a constant, gets an Identity."""
@@ -126,7 +126,7 @@ class LayerBuilder(Builder):
 
     # ------------------------------------------------------------------ forms of a tensor
 
-    def as_image(self, value: Value) -> str:
+    def as_image(self, value: NnValue) -> str:
         """The tensor as [N, H, W, C]."""
         if value.rank == 4:
             return value.reference
@@ -135,7 +135,7 @@ class LayerBuilder(Builder):
         n, h, w, c = value.shape
         return self.add("Reshape", [value.reference, self.ints([-1 if n is None else n, h, w, c], "nhwc")])
 
-    def as_matrix(self, value: Value) -> str:
+    def as_matrix(self, value: NnValue) -> str:
         """The tensor as [N, H·W·C], rows flattened in the order H, W, C."""
         if value.rank == 2:
             return value.reference
@@ -143,7 +143,7 @@ class LayerBuilder(Builder):
             return self.floats(value.constant.reshape(len(value.constant), -1), "matrix")
         return self.add("Reshape", [value.reference, self.ints([-1, value.size], "flat")], name="flatten")
 
-    def as_vector(self, value: Value) -> str:
+    def as_vector(self, value: NnValue) -> str:
         """The tensor as a vector: a bias, slopes, indices."""
         if value.rank == 1:
             return value.reference
@@ -151,20 +151,20 @@ class LayerBuilder(Builder):
             return self.floats(value.constant.reshape(-1), "vector")
         return self.add("Reshape", [value.reference, self.ints([-1], "vector")], name="list")
 
-    def as_shape(self, reference: str, shape: Shape, integer: str | None = None) -> Value:
+    def as_shape(self, reference: str, shape: Shape, integer: str | None = None) -> NnValue:
         """A tensor that has ``shape``'s elements in order, brought to the form that ``shape`` asks for."""
         n, *rest = shape
         rows = [] if shape[:3] == (1, 1, 1) else [-1 if n is None else n]
         to = self.ints([*rows, *(rest if shape[1:3] != (1, 1) else rest[2:])], "shape")
         made = None if integer is None else self.add("Reshape", [integer, to], name="integer")
-        return Value(self.add("Reshape", [reference, to]), shape, integer=made)
+        return NnValue(self.add("Reshape", [reference, to]), shape, integer=made)
 
-    def rows(self, matrix: str, n: int | None, width: int, integer: str | None = None) -> Value:
+    def rows(self, matrix: str, n: int | None, width: int, integer: str | None = None) -> NnValue:
         """A matrix [N, width] as a tensor."""
         shape = (n, 1, 1, width)
-        return self.as_shape(matrix, shape, integer) if n == 1 else Value(matrix, shape, integer=integer)
+        return self.as_shape(matrix, shape, integer) if n == 1 else NnValue(matrix, shape, integer=integer)
 
-    def operands(self, values: Sequence[Value]) -> tuple[list[str], Shape]:
+    def operands(self, values: Sequence[NnValue]) -> tuple[list[str], Shape]:
         """References that broadcast against each other as the ``.nn`` means it, and the shape of the result."""
         shape = self.broadcast_shape(values)
         if shape[1:3] == (1, 1):
@@ -172,7 +172,7 @@ class LayerBuilder(Builder):
         # Beside an image, [B, C] would be taken for [W, C]; a vector is right as it is.
         return [self.as_image(v) if v.rank == 2 else v.reference for v in values], shape
 
-    def broadcast_shape(self, values: Sequence[Value]) -> Shape:
+    def broadcast_shape(self, values: Sequence[NnValue]) -> Shape:
         """The shape of an elementwise result: on each axis the lengths are equal or 1."""
         dims: list[int | None] = [1, 1, 1, 1]
         for value in values:
@@ -197,16 +197,16 @@ class LayerBuilder(Builder):
     def whole(self, array: npt.NDArray[np.float32]) -> list[int]:
         """Numbers that stand for lengths or indices, in order; a ``.nn`` holds them as floats."""
         with np.errstate(invalid="ignore"):
-            fit = bool(np.all(np.abs(array) < MAX_ELEMENTS))
+            fit = bool(np.all(np.abs(array) < MAX_NN_ELEMENTS))
         if not fit:
-            raise self.damaged_error(f"an index or length in it is beyond {MAX_ELEMENTS}", "its dataset is damaged")
+            raise self.damaged_error(f"an index or length in it is beyond {MAX_NN_ELEMENTS}", "its dataset is damaged")
         return [int(v) for v in array.reshape(-1)]
 
     def check_size(self, *lengths: int) -> None:
         """Refuse a tensor of more elements per row than any policy has, before anything is made for it."""
-        if math.prod(lengths) > MAX_ELEMENTS:
+        if math.prod(lengths) > MAX_NN_ELEMENTS:
             raise self.unsupported_error(
-                f"a tensor of {list(lengths)}", f"more than {MAX_ELEMENTS} numbers are not read"
+                f"a tensor of {list(lengths)}", f"more than {MAX_NN_ELEMENTS} numbers are not read"
             )
 
     @property

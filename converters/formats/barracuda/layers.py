@@ -6,20 +6,20 @@ from collections.abc import Callable, Mapping, Sequence
 
 from export_model.converters.formats.barracuda import activations, arithmetic, convolution, dense, shaping
 from export_model.converters.formats.barracuda.format import Layer
-from export_model.converters.formats.barracuda.layer_builder import LayerBuilder, Value
+from export_model.converters.formats.barracuda.layer_builder import LayerBuilder, NnValue
 from export_model.converters.graph.ops.barracuda.vocabulary import Activation, LayerType, layer_label
 from export_model.signatures.errors import DamagedFileError, UnsupportedOpError
 
 #: Takes (builder, the layer's inputs and then its datasets).
-Translate = Callable[[LayerBuilder, Sequence[Value]], Value]
+Translate = Callable[[LayerBuilder, Sequence[NnValue]], NnValue]
 _ANY = 1 << 16
 
 
-def _same(b: LayerBuilder, args: Sequence[Value]) -> Value:
+def _same(b: LayerBuilder, args: Sequence[NnValue]) -> NnValue:
     return args[0]
 
 
-def _activation(b: LayerBuilder, args: Sequence[Value]) -> Value:
+def _activation(b: LayerBuilder, args: Sequence[NnValue]) -> NnValue:
     if b.layer.activation == Activation.PRELU:
         if len(args) != 2:
             raise b.damaged_error(f"it has {len(args)} inputs", "a PRelu takes a tensor and its slopes")
@@ -82,7 +82,7 @@ _WHY: Mapping[LayerType, str] = {
 }
 
 
-def translate(b: LayerBuilder, layer: Layer, args: Sequence[Value]) -> Value:
+def translate(b: LayerBuilder, layer: Layer, args: Sequence[NnValue]) -> NnValue:
     """What a layer computes, activation included; ``args`` are its inputs and then its datasets.
 
     Raises UnsupportedOpError that names the layer, GraphError where it contradicts itself.

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from export_model.converters.formats.barracuda.format import EIGHT_AXES
-from export_model.converters.formats.barracuda.layer_builder import LayerBuilder, Shape, Value, with_length
+from export_model.converters.formats.barracuda.layer_builder import LayerBuilder, NnValue, Shape, with_length
 from export_model.converters.graph.ops.barracuda.vocabulary import C, H, N, W
 from export_model.converters.graph.types import INT32
 
@@ -33,13 +33,13 @@ def axis_of(b: LayerBuilder, axis: int) -> int:
     raise b.unsupported_error(f"the axis is {axis}", "the tensors of a policy have the axes N, H, W and C")
 
 
-def flatten(b: LayerBuilder, args: Sequence[Value]) -> Value:
+def flatten(b: LayerBuilder, args: Sequence[NnValue]) -> NnValue:
     """[N, 1, 1, H·W·C]."""
     x = args[0]
     return x if x.rank != 4 else b.rows(b.as_matrix(x), x.n, x.size)
 
 
-def reshape(b: LayerBuilder, args: Sequence[Value]) -> Value:
+def reshape(b: LayerBuilder, args: Sequence[NnValue]) -> NnValue:
     """The elements in order in the shape ``pool``: −1 is what is left, 0 the length it had.
 
     An empty ``pool`` takes the shape of the second input, or from 2.x on (``axis`` 1) the numbers in it.
@@ -59,7 +59,7 @@ def reshape(b: LayerBuilder, args: Sequence[Value]) -> Value:
     return b.as_shape(x.reference, _reshaped_shape(b, x, target), x.integer)
 
 
-def _reshaped_shape(b: LayerBuilder, x: Value, target: list[int]) -> Shape:
+def _reshaped_shape(b: LayerBuilder, x: NnValue, target: list[int]) -> Shape:
     n, *lengths = x.shape
     wanted = [length if t == 0 else t for t, length in zip(target[1:], lengths, strict=True)]
     if [target[0], *wanted].count(-1) > 1 or min(target) < -1:
@@ -85,7 +85,7 @@ def _reshaped_shape(b: LayerBuilder, x: Value, target: list[int]) -> Shape:
     return rows, h, w, c
 
 
-def squeeze(b: LayerBuilder, args: Sequence[Value]) -> Value:
+def squeeze(b: LayerBuilder, args: Sequence[NnValue]) -> NnValue:
     """Squeeze and Unsqueeze: no version of Barracuda runs them; where H and W are 1 nothing could move."""
     x = args[0]
     if x.rank == 4:
@@ -93,7 +93,7 @@ def squeeze(b: LayerBuilder, args: Sequence[Value]) -> Value:
     return x
 
 
-def transpose(b: LayerBuilder, args: Sequence[Value]) -> Value:
+def transpose(b: LayerBuilder, args: Sequence[NnValue]) -> NnValue:
     """Axis i of the result is axis ``pool[i]`` of the input."""
     x = args[0]
     order = tuple(b.layer.pool)
@@ -112,7 +112,7 @@ def transpose(b: LayerBuilder, args: Sequence[Value]) -> Value:
     return b.as_shape(turned, (n, int(h or 0), int(w or 0), int(c or 0)))
 
 
-def concat(b: LayerBuilder, args: Sequence[Value]) -> Value:
+def concat(b: LayerBuilder, args: Sequence[NnValue]) -> NnValue:
     """The inputs one after the other along an axis; the other lengths are equal."""
     axis = axis_of(b, b.layer.axis)
     if len(args) == 1:
@@ -135,7 +135,7 @@ def concat(b: LayerBuilder, args: Sequence[Value]) -> Value:
 # ------------------------------------------------------------------ cutting
 
 
-def strided_slice(b: LayerBuilder, args: Sequence[Value]) -> Value:
+def strided_slice(b: LayerBuilder, args: Sequence[NnValue]) -> NnValue:
     """``pad`` to ``pool`` in steps of ``stride``, four (or eight) entries each."""
     x = args[0]
     starts, ends, steps = (_entries(b, v, d) for v, d in ((b.layer.pad, 0), (b.layer.pool, 0), (b.layer.stride, 1)))
@@ -153,7 +153,7 @@ def strided_slice(b: LayerBuilder, args: Sequence[Value]) -> Value:
     if x.rank == 1:
         return b.as_shape(_strided_slice(b, b.as_matrix(x), cuts[2:], "part"), shape)
     integer = None if x.integer is None else _strided_slice(b, x.integer, cuts[2:], "integers")
-    return Value(_strided_slice(b, x.reference, cuts[2:], "part"), shape, integer=integer)
+    return NnValue(_strided_slice(b, x.reference, cuts[2:], "part"), shape, integer=integer)
 
 
 def _strided_slice(b: LayerBuilder, x: str, cuts: Sequence[tuple[int, int, int]], label: str) -> str:
@@ -199,7 +199,7 @@ def _cut(b: LayerBuilder, start: int, end: int, step: int, length: int, name: st
     return first, last, step
 
 
-def gather(b: LayerBuilder, args: Sequence[Value]) -> Value:
+def gather(b: LayerBuilder, args: Sequence[NnValue]) -> NnValue:
     """Elements along an axis: chosen by constants, or by a number per agent out of the rows of a constant table."""
     x, index = args
     axis = axis_of(b, b.layer.axis)
@@ -226,12 +226,12 @@ def gather(b: LayerBuilder, args: Sequence[Value]) -> Value:
 # ------------------------------------------------------------------ repeating, and blocks
 
 
-def tile(b: LayerBuilder, args: Sequence[Value]) -> Value:
+def tile(b: LayerBuilder, args: Sequence[NnValue]) -> NnValue:
     """The tensor ``pool`` times along each axis."""
     return _repeat(b, args[0], b.four(b.layer.pool))
 
 
-def expand(b: LayerBuilder, args: Sequence[Value]) -> Value:
+def expand(b: LayerBuilder, args: Sequence[NnValue]) -> NnValue:
     """Axes of length 1 repeated to the lengths in ``pool``."""
     x = args[0]
     target = b.four(b.layer.pool)
@@ -243,7 +243,7 @@ def expand(b: LayerBuilder, args: Sequence[Value]) -> Value:
     return _repeat(b, x, factors)
 
 
-def _repeat(b: LayerBuilder, x: Value, factors: Sequence[int]) -> Value:
+def _repeat(b: LayerBuilder, x: NnValue, factors: Sequence[int]) -> NnValue:
     if min(factors) < 1 or (factors[N] != 1 and x.n is None):
         raise b.unsupported_error(f"it repeats {list(factors)} times", "a policy has one row per agent")
     n, h, w, c = x.shape
@@ -254,7 +254,7 @@ def _repeat(b: LayerBuilder, x: Value, factors: Sequence[int]) -> Value:
     return b.as_shape(b.add("Tile", [b.as_image(x), b.ints(list(factors), "times")]), shape)
 
 
-def depth_to_space(b: LayerBuilder, args: Sequence[Value]) -> Value:
+def depth_to_space(b: LayerBuilder, args: Sequence[NnValue]) -> NnValue:
     """Blocks of ``pool`` = [width, height] pixels out of the channels; ``axis`` 0: block first, 1: channel first."""
     x = args[0]
     across, down = _block(b)
@@ -272,7 +272,7 @@ def depth_to_space(b: LayerBuilder, args: Sequence[Value]) -> Value:
     return b.as_shape(turned, (n, h * down, w * across, deep))
 
 
-def space_to_depth(b: LayerBuilder, args: Sequence[Value]) -> Value:
+def space_to_depth(b: LayerBuilder, args: Sequence[NnValue]) -> NnValue:
     """Blocks of ``pool`` = [width, height] pixels into the channels, row by row."""
     x = args[0]
     across, down = _block(b)

@@ -16,7 +16,7 @@ from msgspec.structs import replace
 from export_model.converters.files import tensorflow_messages as schema
 from export_model.converters.files.external_data import Detached
 from export_model.converters.formats.checkpoint.tensor_bundle import Extents, several
-from export_model.converters.formats.checkpoint.training_graph import Saved, TrainingGraph
+from export_model.converters.formats.checkpoint.training_graph import SavedVariable, TrainingGraph
 from export_model.converters.formats.frozen_graph.tensors import constant
 from export_model.converters.graph.nodes import Graph, NameScope, Node, node_of, topological
 from export_model.converters.graph.ops.table import EFFECTS, VARIABLES, hands_on
@@ -111,12 +111,12 @@ def _key(node: Node, training: TrainingGraph) -> str:
     return saved.key if saved is not None else str(node.attrs.get("shared_name") or node.name)
 
 
-def _place(node: Node, training: TrainingGraph, checkpoint: Values | None) -> Saved | None:
+def _place(node: Node, training: TrainingGraph, checkpoint: Values | None) -> SavedVariable | None:
     """Where the checkpoint keeps a variable: the saver's name for it, the name it is shared under, its own."""
     if checkpoint is None:
         return None
     saved = training.saved.get(node.name)
-    names = [Saved(str(name)) for name in (node.attrs.get("shared_name"), node.name) if name]
+    names = [SavedVariable(str(name)) for name in (node.attrs.get("shared_name"), node.name) if name]
     for place in ([saved] if saved is not None else []) + names:
         if place.key in checkpoint:
             return place

@@ -30,7 +30,7 @@ _STEP = re.compile(r"(?P<name>.+)-(?P<step>\d{1,18})(?:\.[A-Za-z]\w*)?")
 _NOT_EXPORTS = (RAW_GRAPH, "saved_model.pb", "keras_metadata.pb", "fingerprint.pb")
 
 
-class Kept(Struct, frozen=True):
+class KeptStep(Struct, frozen=True):
     """What training kept at a step: an export, or a checkpoint's index (``prefix`` is its path without ``.index``)."""
 
     path: Path
@@ -58,7 +58,7 @@ class Behavior(Struct, frozen=True):
     name: str
     folder: Path
     finals: tuple[Path, ...] = ()
-    kept: tuple[Kept, ...] = ()
+    kept: tuple[KeptStep, ...] = ()
 
     @property
     def steps(self) -> list[int]:
@@ -72,9 +72,9 @@ def step_of(name: str) -> tuple[str, int | None]:
     return (match["name"], int(match["step"])) if match else (name, None)
 
 
-def checkpoints(folder: Path) -> list[Kept]:
+def checkpoints(folder: Path) -> list[KeptStep]:
     """The checkpoints in a folder, the newest last."""
-    found = [Kept(p, step_of(p.stem)[1]) for p in _files(folder) if p.suffix == ".index"]
+    found = [KeptStep(p, step_of(p.stem)[1]) for p in _files(folder) if p.suffix == ".index"]
     return sorted(found, key=lambda k: (-1 if k.step is None else k.step, k.path.name))
 
 
@@ -101,7 +101,7 @@ def behaviors(folder: Path) -> list[Behavior]:
         stem, step = step_of(path.stem)
         if step is not None and path.suffix in STEPPED and (stem in found or stem in names):
             known = found.get(stem, Behavior(stem, folder))
-            found[stem] = replace(known, kept=(*known.kept, Kept(path, step)))
+            found[stem] = replace(known, kept=(*known.kept, KeptStep(path, step)))
         else:
             known = found.get(path.stem, Behavior(path.stem, folder))
             found[path.stem] = replace(known, finals=(*known.finals, path))
@@ -162,7 +162,7 @@ def _behavior(folder: Path) -> Behavior | None:
     steps = {p: step for p in files if (step := _as_step(p, name)) is not None}
     if not steps and not any(p.name in (RAW_GRAPH, FROZEN_GRAPH) or p.suffix in (".index", ".pt") for p in files):
         return None
-    kept = [Kept(p, step) for p, step in steps.items() if p.suffix in (".onnx", ".nn")]
-    kept += [Kept(p, step_of(p.stem)[1]) for p in files if p.suffix == ".pt"]
+    kept = [KeptStep(p, step) for p, step in steps.items() if p.suffix in (".onnx", ".nn")]
+    kept += [KeptStep(p, step_of(p.stem)[1]) for p in files if p.suffix == ".pt"]
     finals = tuple(p for p in files if _final(p) is not None and p not in steps)
     return Behavior(name, folder, finals, (*checkpoints(folder), *kept))

@@ -96,7 +96,7 @@ def read_checkpoint(
     )
 
 
-def newest(found: Sequence[listing.Kept], step: int | None, folder: Path) -> listing.Kept:
+def newest(found: Sequence[listing.KeptStep], step: int | None, folder: Path) -> listing.KeptStep:
     """The checkpoint of ``step``, by default the newest. Raises UsageError with the steps there are, SourceError."""
     if not found:
         _refuse_version_1(folder)

@@ -26,7 +26,7 @@ from export_model.converters.graph.ops.table import ASSIGNS, RESTORES
 from export_model.signatures.errors import DamagedFileError, NotAPolicyError
 
 
-class Saved(Struct, frozen=True):
+class SavedVariable(Struct, frozen=True):
     """Where a variable's value is in a checkpoint: a tensor, or a part of one."""
 
     key: str
@@ -37,7 +37,7 @@ class TrainingGraph(Struct, frozen=True):
     """A graph with variables, and where their values are kept (for those that the graph's saver names)."""
 
     graph: Graph
-    saved: Mapping[str, Saved] = field(default_factory=dict)
+    saved: Mapping[str, SavedVariable] = field(default_factory=dict)
     #: the GraphDef as it was read; None where there is none (a live session)
     definition: Any = None
 
@@ -87,10 +87,10 @@ def _without_initial_values(graph_def: Any) -> list[Any]:
 # ------------------------------------------------------------------ the graph's saver
 
 
-def saved_places(graph_def: Any) -> dict[str, Saved]:
+def saved_places(graph_def: Any) -> dict[str, SavedVariable]:
     """Variable's node → its place in a checkpoint, by the first saver that restores it."""
     nodes = {proto.name: proto for proto in graph_def.node}
-    found: dict[str, Saved] = {}
+    found: dict[str, SavedVariable] = {}
     producers: dict[str, tuple[Any, int]] = {}
     for proto in graph_def.node:
         inputs = _inputs(proto)
@@ -101,7 +101,7 @@ def saved_places(graph_def: Any) -> dict[str, Saved]:
             continue
         names, slices = (_strings(nodes, restore, position) for position in (1, 2))
         if index < len(names):
-            place = Saved(names[index], _extents(slices[index]) if index < len(slices) else None)
+            place = SavedVariable(names[index], _extents(slices[index]) if index < len(slices) else None)
             found.setdefault(node_of(inputs[0]), place)
     return found
 

@@ -63,7 +63,7 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
     return write_program(policy, options, ".mjs", _text)
 
 
-class Module(Struct, frozen=True):
+class WrittenModule(Struct, frozen=True):
     """A module: its text, its class, the content of its file of weights, the shape of each float32 constant by name."""
 
     text: str
@@ -72,13 +72,13 @@ class Module(Struct, frozen=True):
     weights: Mapping[str, tuple[int, ...]]
 
 
-def write_module(policy: Policy, options: WriteOptions) -> Module:
+def write_module(policy: Policy, options: WriteOptions) -> WrittenModule:
     """Write the module of a policy for who looks into it. Raises UnsupportedOpError."""
     plan = plan_of(policy, options)
     text, printer = _module(policy.name, plan)
     places = [kept.place for kept in plan.weights.kept if kept.place.dtype == np.float32]
     shapes = {printer.name(p): p.value.shape for p in places if p.value is not None}
-    return Module(text, plan.header.class_name, plan.weights.file or b"", shapes)
+    return WrittenModule(text, plan.header.class_name, plan.weights.file or b"", shapes)
 
 
 def _text(name: str, plan: Plan) -> str:

@@ -12,7 +12,7 @@ from typing import Any
 from msgspec import Struct, field
 from msgspec.structs import replace
 
-from export_model.converters.compiler.passes.unroll import MAX_NODES
+from export_model.converters.compiler.passes.unroll import MAX_POLICY_NODES
 from export_model.converters.graph.nodes import NameScope
 from export_model.signatures.errors import DamagedFileError, NotAPolicyError
 
@@ -22,7 +22,7 @@ MODELS = frozenset(("Functional", "Model", "Sequential"))
 _EXPORTED = {"GroupQueryAttention": "GroupedQueryAttention"}
 
 
-class Place(Struct, frozen=True):
+class CallResult(Struct, frozen=True):
     """The ``tensor``-th result of the ``call``-th call of a layer."""
 
     layer: str
@@ -31,13 +31,13 @@ class Place(Struct, frozen=True):
 
 
 class LayerCall(Struct, frozen=True):
-    """One call of a layer: its arguments, ``Place`` where they are tensors."""
+    """One call of a layer: its arguments, ``CallResult`` where they are tensors."""
 
     args: tuple[Any, ...]
     kwargs: Mapping[str, Any] = field(default_factory=dict)
 
 
-class Layer(Struct, frozen=True):
+class KerasLayer(Struct, frozen=True):
     """A layer by its class and settings; ``model`` is what it holds where it is a model itself."""
 
     kind: str
@@ -53,9 +53,9 @@ class LayeredModel(Struct, frozen=True):
     """Layers and their calls; ``outputs`` are keyed by what the model calls them."""
 
     name: str
-    layers: tuple[Layer, ...]
-    inputs: tuple[Place, ...]
-    outputs: Mapping[str, Place]
+    layers: tuple[KerasLayer, ...]
+    inputs: tuple[CallResult, ...]
+    outputs: Mapping[str, CallResult]
 
 
 def model_of(config: Any) -> LayeredModel:
@@ -68,7 +68,7 @@ def model_of(config: Any) -> LayeredModel:
     return layer.model
 
 
-def layer_of(entry: Mapping[str, Any]) -> Layer:
+def layer_of(entry: Mapping[str, Any]) -> KerasLayer:
     """One layer of a configuration."""
     kind, config = _text(entry["class_name"]), entry["config"]
     kind = _EXPORTED.get(kind, kind)
@@ -76,20 +76,20 @@ def layer_of(entry: Mapping[str, Any]) -> Layer:
     if kind in MODELS:
         name = _text(config["name"] if isinstance(config, Mapping) else entry.get("name", kind.lower()))
         model = _sequential(name, config) if kind == "Sequential" else _functional(name, config)
-        return Layer(kind, _text(entry.get("name", name)), {}, _calls(entry.get("inbound_nodes") or ()), model)
+        return KerasLayer(kind, _text(entry.get("name", name)), {}, _calls(entry.get("inbound_nodes") or ()), model)
     name = _text(entry.get("name") or config.get("name") or kind.lower())
     nodes: Sequence[Any] = entry.get("inbound_nodes") or ()
     # An .h5 of Keras 3 does not say the module: Multiply may be either.
     bare = not module and bool(nodes) and isinstance(nodes[0], Mapping) and "trainable" not in config
-    return Layer(kind, name, config, _calls(nodes), operation=bare or ".ops." in f"{module}.")
+    return KerasLayer(kind, name, config, _calls(nodes), operation=bare or ".ops." in f"{module}.")
 
 
 def _few(entries: Any) -> Any:
     """The layers of a model, which are counted before one is looked at."""
-    if len(entries) > MAX_NODES:
+    if len(entries) > MAX_POLICY_NODES:
         raise NotAPolicyError(
             f"it has {len(entries)} layers",
-            why=f"no more than {MAX_NODES} are read; a policy has some tens",
+            why=f"no more than {MAX_POLICY_NODES} are read; a policy has some tens",
             fix="save the policy alone",
         )
     return entries
@@ -130,16 +130,16 @@ def _sequential(name: str, config: Any) -> LayeredModel:
         given = {"batch_shape": shape, "dtype": "float32"}
         if first.kind == "Embedding":
             given["dtype"] = "int32"
-        layers.insert(0, Layer("InputLayer", f"{first.name}_input", given))
+        layers.insert(0, KerasLayer("InputLayer", f"{first.name}_input", given))
     if not layers:
         raise DamagedFileError(f"the model {name!r} has no layers", fix="save the model again")
-    fed = [LayerCall((Place(before.name, 0, 0),)) for before in layers]
+    fed = [LayerCall((CallResult(before.name, 0, 0),)) for before in layers]
     chained = (layers[0], *(replace(layer, calls=(call,)) for layer, call in zip(layers[1:], fed, strict=False)))
-    first_place, last = Place(chained[0].name, 0, 0), Place(chained[-1].name, 0, 0)
+    first_place, last = CallResult(chained[0].name, 0, 0), CallResult(chained[-1].name, 0, 0)
     return LayeredModel(name, chained, (first_place,), {last.layer: last})
 
 
-def input_shape(layer: Layer) -> Sequence[int | None]:
+def input_shape(layer: KerasLayer) -> Sequence[int | None]:
     """The shape of an InputLayer, its batch first."""
     config = layer.config
     shape = config.get("batch_shape", config.get("batch_input_shape"))
@@ -148,7 +148,7 @@ def input_shape(layer: Layer) -> Sequence[int | None]:
     return tuple(shape)
 
 
-def cells_of(layer: Layer) -> list[Layer]:
+def cells_of(layer: KerasLayer) -> list[KerasLayer]:
     """The cells of an ``RNN``, which run one after the other at each step; TensorFlow.js lists them."""
     said = layer.config.get("cell") if layer.kind == "RNN" else None
     if isinstance(said, Mapping) and said["class_name"] == "StackedRNNCells":
@@ -201,11 +201,11 @@ def _older_value(value: Any) -> Any:
     return value
 
 
-def _place(entry: Sequence[Any]) -> Place:
-    return Place(str(entry[0]), int(entry[1]), int(entry[2]))
+def _place(entry: Sequence[Any]) -> CallResult:
+    return CallResult(str(entry[0]), int(entry[1]), int(entry[2]))
 
 
-def _places(value: Any) -> Iterator[tuple[str, Place]]:
+def _places(value: Any) -> Iterator[tuple[str, CallResult]]:
     """(key or an empty name, tensor) of ``input_layers`` and ``output_layers``: one, several, or a dictionary."""
     if isinstance(value, Mapping):
         for key, inner in value.items():
@@ -217,9 +217,9 @@ def _places(value: Any) -> Iterator[tuple[str, Place]]:
             yield from _places(inner)
 
 
-def tensors_in(value: Any) -> Iterator[Place]:
+def tensors_in(value: Any) -> Iterator[CallResult]:
     """The tensors among the arguments of a call."""
-    if isinstance(value, Place):
+    if isinstance(value, CallResult):
         yield value
     elif isinstance(value, Mapping):
         for inner in value.values():

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from export_model.converters.compiler.passes.unroll import MAX_NODES
+from export_model.converters.compiler.passes.unroll import MAX_POLICY_NODES
 from export_model.converters.formats.keras.layers.resizing import UNTRAINED
 from export_model.converters.formats.keras.layers.step import Step
 from export_model.converters.formats.keras.layers.table import LAYERS, OPERATIONS
-from export_model.converters.formats.keras.model import Layer, LayeredModel, Place, input_shape, tensors_in
-from export_model.converters.formats.keras.weights import Weights
-from export_model.converters.formats.saved_model.signature import ModelSignature, Tensor
+from export_model.converters.formats.keras.model import CallResult, KerasLayer, LayeredModel, input_shape, tensors_in
+from export_model.converters.formats.keras.weights import KerasWeights
+from export_model.converters.formats.saved_model.signature import ModelSignature, TensorInfo
 from export_model.converters.graph.builder import Builder
 from export_model.converters.graph.nodes import MAX_NAME, NameScope, Node, TensorShape
 from export_model.converters.graph.types import FLOAT32
@@ -39,7 +39,7 @@ class UnknownLayerError(NotAPolicyError):
     """A layer that is not read as data; Keras itself may know it."""
 
 
-class Network(Builder):
+class KerasNetwork(Builder):
     """The graph of a model in the making."""
 
     def __init__(self, version: str) -> None:
@@ -56,26 +56,28 @@ class Network(Builder):
         self.results: dict[str, str] = {}
         self._single_step = False
 
-    def whole(self, model: LayeredModel, weights: Weights) -> ModelSignature:
+    def whole(self, model: LayeredModel, weights: KerasWeights) -> ModelSignature:
         """Build a model; returns its signature on the graph. Raises UnknownLayerError, UnsupportedOpError and more."""
         self._single_step = _carries_state(model)
-        places: dict[str, Tensor] = {}
-        given: dict[Place, str] = {}
+        places: dict[str, TensorInfo] = {}
+        given: dict[CallResult, str] = {}
         layers = {layer.name: layer for layer in model.layers}
         for place in model.inputs:
             given[place] = self._input(layers[place.layer], places)
         self.results = dict(zip(model.outputs, self.model(model, weights, given, "", 0), strict=True))
         for placeholder, name in self.kept.items():
             self.results[name] = self.states[placeholder]
-            places[placeholder] = Tensor(placeholder, FLOAT32, self.nodes[self.position[placeholder]].attrs["shape"])
+            places[placeholder] = TensorInfo(
+                placeholder, FLOAT32, self.nodes[self.position[placeholder]].attrs["shape"]
+            )
         self.prefix = ""
         keys = {key: self._output(key, reference) for key, reference in self.results.items()}
         return ModelSignature(places, keys)
 
-    def _output(self, key: str, reference: str) -> Tensor:
-        return Tensor(self.append(Node(self._fresh(key), "Identity", (reference,), origin=key)))
+    def _output(self, key: str, reference: str) -> TensorInfo:
+        return TensorInfo(self.append(Node(self._fresh(key), "Identity", (reference,), origin=key)))
 
-    def _input(self, layer: Layer, places: dict[str, Tensor]) -> str:
+    def _input(self, layer: KerasLayer, places: dict[str, TensorInfo]) -> str:
         """A placeholder for an input, its batch free."""
         if layer.config.get("sparse") or layer.config.get("ragged"):
             raise UnknownLayerError(f"its input {layer.name!r} is sparse or ragged")
@@ -103,13 +105,13 @@ class Network(Builder):
         dims = (None, *(int(n) for n in rest if n is not None))
         self.prefix = ""
         made = self.named_input(self._fresh(layer.name), kind, dims, layer.name)
-        places[layer.name] = Tensor(made, kind, TensorShape(dims))
+        places[layer.name] = TensorInfo(made, kind, TensorShape(dims))
         return made
 
     # ------------------------------------------------------------------ calls in their order
 
     def model(
-        self, model: LayeredModel, weights: Weights, given: Mapping[Place, str], prefix: str, depth: int
+        self, model: LayeredModel, weights: KerasWeights, given: Mapping[CallResult, str], prefix: str, depth: int
     ) -> list[str]:
         """The outputs of a model whose inputs are ``given``."""
         self.models += 1
@@ -127,10 +129,10 @@ class Network(Builder):
 
     def _call_layer(
         self,
-        layer: Layer,
+        layer: KerasLayer,
         number: int,
         results: Results,
-        arrays: Mapping[str, Weights],
+        arrays: Mapping[str, KerasWeights],
         prefix: str,
         depth: int,
     ) -> list[str]:
@@ -167,7 +169,7 @@ class Network(Builder):
             )
         return [made] if isinstance(made, str) else list(made)
 
-    def _check(self, layer: Layer, path: str, args: Any, kwargs: Mapping[str, Any]) -> None:
+    def _check(self, layer: KerasLayer, path: str, args: Any, kwargs: Mapping[str, Any]) -> None:
         """Raise UnknownLayerError where a layer is called or computes in a way that would be left out in silence."""
         flat = [v for a in args for v in (a if isinstance(a, list) else [a])]
         odd = [str(v)[:60] for v in flat if not isinstance(v, str | None)]
@@ -213,16 +215,16 @@ def _first_calls(model: LayeredModel) -> dict[str, int]:
     return {p.layer: 1 for p in places if p.layer in counts and p.call == counts[p.layer]}
 
 
-def _order_calls(model: LayeredModel, given: Results, first: Mapping[str, int]) -> list[tuple[Layer, int]]:
+def _order_calls(model: LayeredModel, given: Results, first: Mapping[str, int]) -> list[tuple[KerasLayer, int]]:
     """The calls of a model, each behind those that it reads; layers are gone through again and again, as Keras does.
 
     Raises DamagedFileError where one waits for what no layer gives.
     """
     calls = [(layer, number) for layer in model.layers for number in range(len(layer.calls))]
-    if len(calls) > MAX_NODES:
+    if len(calls) > MAX_POLICY_NODES:
         raise NotAPolicyError(
             f"its layers are called {len(calls)} times",
-            why=f"no more than {MAX_NODES} calls are read; a policy has some tens",
+            why=f"no more than {MAX_POLICY_NODES} calls are read; a policy has some tens",
             fix="save the policy alone",
         )
     maker = {(layer.name, number + first.get(layer.name, 0)): at for at, (layer, number) in enumerate(calls)}
@@ -247,7 +249,7 @@ def _order_calls(model: LayeredModel, given: Results, first: Mapping[str, int]) 
     return [calls[at] for at in sorted(ready, key=lambda at: (turn[at], at))]
 
 
-def unknown_layer_error(layer: Layer, path: str) -> UnknownLayerError:
+def unknown_layer_error(layer: KerasLayer, path: str) -> UnknownLayerError:
     """A layer that the table does not have."""
     kind = layer.kind if layer.kind.isprintable() else repr(layer.kind)
     return UnknownLayerError(f"its layer {path[:200]!r} is {kind[:200]}, which is not read as data")
@@ -268,7 +270,7 @@ def _carries_state(model: LayeredModel) -> bool:
 
 def _resolve(value: Any, results: Results) -> Any:
     """Arguments with references in place of their tensors."""
-    if isinstance(value, Place):
+    if isinstance(value, CallResult):
         return results[value.layer, value.call][value.tensor]
     if isinstance(value, dict):
         return {k: _resolve(v, results) for k, v in value.items()}

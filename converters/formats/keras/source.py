@@ -25,8 +25,8 @@ from export_model.converters.formats.keras.config import (
     stateful_layer,
 )
 from export_model.converters.formats.keras.model import model_of
-from export_model.converters.formats.keras.network import Network, UnknownLayerError
-from export_model.converters.formats.keras.weights import Groups, Listed, Weights
+from export_model.converters.formats.keras.network import KerasNetwork, UnknownLayerError
+from export_model.converters.formats.keras.weights import Groups, KerasWeights, Listed
 from export_model.converters.formats.saved_model.signature import (
     declared_outputs,
     expose,
@@ -78,7 +78,7 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
     return [replace(model, facts=replace(model.facts, notes=(*model.facts.notes, note)))]
 
 
-def _read_stored(given: Fetched) -> tuple[Any, Weights, str, str]:
+def _read_stored(given: Fetched) -> tuple[Any, KerasWeights, str, str]:
     """Return the configuration, the weights, Keras' version and the loss of a file.
 
     Raises NotAPolicyError where it names code.
@@ -102,13 +102,15 @@ def _read_stored(given: Fetched) -> tuple[Any, Weights, str, str]:
     return config, weights, stored.version or "", loss_of(_configuration(stored.training or "null"))
 
 
-def build_layered(files: tuple[Path, ...], config: Any, weights: Weights, version: str, loss: str = "") -> SourceModel:
+def build_layered(
+    files: tuple[Path, ...], config: Any, weights: KerasWeights, version: str, loss: str = ""
+) -> SourceModel:
     """The model of a configuration with its weights; ``loss`` is what it was compiled with.
 
     Raises UnknownLayerError, SourceError and its kinds.
     """
     try:
-        net = Network(version)
+        net = KerasNetwork(version)
         model = model_of(config)
         signature = net.whole(model, weights)
         graph, roles = expose(net.graph(), signature)
@@ -132,7 +134,7 @@ def build_layered(files: tuple[Path, ...], config: Any, weights: Weights, versio
 
 
 def of_web_model(
-    files: tuple[Path, ...], topology: Mapping[str, Any], weights: Weights, training: Any = None
+    files: tuple[Path, ...], topology: Mapping[str, Any], weights: KerasWeights, training: Any = None
 ) -> SourceModel:
     """A TensorFlow.js layers model; ``topology`` is its ``modelTopology``, ``training`` its ``trainingConfig``.
 

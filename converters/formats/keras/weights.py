@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from export_model.converters.formats.keras.model import Layer, cells_of
+from export_model.converters.formats.keras.model import KerasLayer, cells_of
 
 Arrays = tuple[np.ndarray, ...]
 #: Under which names the parts of a layer lie, in the order in which Keras makes them; "_" may stand before each.
@@ -25,13 +25,13 @@ _PARTS = (
 _FOLDERS = ("layers", "_layer_checkpoint_dependencies")
 
 
-class Weights(Protocol):
+class KerasWeights(Protocol):
     """The arrays of a layer, or of the layers of a model."""
 
-    def arrays(self, layer: Layer) -> Arrays:
+    def arrays(self, layer: KerasLayer) -> Arrays:
         """All of a layer's."""
 
-    def among(self, layers: Sequence[Layer]) -> Mapping[str, Weights]:
+    def among(self, layers: Sequence[KerasLayer]) -> Mapping[str, KerasWeights]:
         """Those of each layer of a model, by its name."""
 
 
@@ -41,7 +41,7 @@ class Groups:
     def __init__(self, stored: Mapping[str, np.ndarray]) -> None:
         self.stored = stored
 
-    def arrays(self, layer: Layer) -> Arrays:
+    def arrays(self, layer: KerasLayer) -> Arrays:
         """The layer's own, then those of its parts."""
         return tuple(self._own([x.kind for x in cells_of(layer)])) if self.stored else ()
 
@@ -58,7 +58,7 @@ class Groups:
     def _inside(self, path: str) -> Groups:
         return Groups({k.removeprefix(f"{path}/"): a for k, a in self.stored.items() if k.startswith(f"{path}/")})
 
-    def among(self, layers: Sequence[Layer]) -> Mapping[str, Weights]:
+    def among(self, layers: Sequence[KerasLayer]) -> Mapping[str, KerasWeights]:
         """See Weights; layers of one class are numbered in the order of the configuration."""
         folder = next((f for f in _FOLDERS if any(k.startswith(f"{f}/") for k in self.stored)), _FOLDERS[0])
         inside, held = self._inside(folder), [x for x in layers if not x.operation]
@@ -86,11 +86,11 @@ class Listed:
     def __init__(self, entries: Sequence[tuple[str, np.ndarray]], owners: Sequence[str] = ()) -> None:
         self.entries, self.owners = entries, owners
 
-    def arrays(self, layer: Layer) -> Arrays:
+    def arrays(self, layer: KerasLayer) -> Arrays:
         """All of them."""
         return tuple(array for _, array in self.entries)
 
-    def among(self, layers: Sequence[Layer]) -> Mapping[str, Weights]:
+    def among(self, layers: Sequence[KerasLayer]) -> Mapping[str, KerasWeights]:
         """See Weights."""
         if self.owners:
             owned = list(zip(self.owners, self.entries, strict=True))

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from export_model.converters.files.chunks import Pieces
-from export_model.converters.formats.litert.schema import IDENTIFIER, OPTIONS, TABLES, Field
+from export_model.converters.formats.litert.schema import IDENTIFIER, OPTIONS, TABLES, TableField
 from export_model.signatures.errors import DamagedFileError, TooLargeError
 
 Table = dict[str, Any]
@@ -100,7 +100,7 @@ class _Writer:
         present = [f for f in known if f.name in values and not (f.kind in _SCALARS and values[f.name] == f.default)]
         slots = [0] * (1 + max((f.slot for f in present), default=-1))
         piece = _Piece(bytearray(4), 4)
-        linked: list[tuple[int, Field]] = []
+        linked: list[tuple[int, TableField]] = []
         # One field of eight bytes must lie at a multiple of that: they go behind four bytes of nothing.
         wide = any(f.kind in ("i64", "u64") for f in present)
         if wide:
@@ -121,7 +121,7 @@ class _Writer:
             piece.links.append((where, self._linked(field, values)))
         return piece
 
-    def _linked(self, field: Field, values: Mapping[str, Any]) -> _Piece:
+    def _linked(self, field: TableField, values: Mapping[str, Any]) -> _Piece:
         value, kind = values[field.name], field.kind
         if kind == "str":
             text = value.encode()
@@ -151,7 +151,7 @@ class _Writer:
         return self.leaves.setdefault((piece.vtable, bytes([piece.align, piece.lead]) + piece.data), piece)
 
 
-def _width(field: Field) -> int:
+def _width(field: TableField) -> int:
     return struct.calcsize(_SCALARS.get(field.kind, "I"))
 
 
@@ -173,10 +173,10 @@ def _join_bytes(parts: Sequence[bytes | np.ndarray]) -> list[bytes | np.ndarray]
 
 def decode(data: bytes | memoryview) -> Table:
     """The ``Model`` of a file. Raises DamagedFileError."""
-    return _Reader(data).model()
+    return _TableReader(data).model()
 
 
-class _Reader:
+class _TableReader:
     def __init__(self, data: bytes | memoryview) -> None:
         self.data = memoryview(data)
         self.read: dict[tuple[str, int], Table] = {}
@@ -218,7 +218,7 @@ class _Reader:
                 self._field(made, field, at + where)
         return made
 
-    def _field(self, made: Table, field: Field, at: int) -> None:
+    def _field(self, made: Table, field: TableField, at: int) -> None:
         if field.kind in _SCALARS:
             made[field.name] = self._number(_SCALARS[field.kind], at)
             return

@@ -15,13 +15,13 @@ from export_model.converters.compiler.options import MAX_PORTS
 from export_model.converters.formats.embed import contract_of
 from export_model.converters.formats.litert.artifact import note, operator_of
 from export_model.converters.formats.litert.flatbuffer import Table, decode
-from export_model.converters.formats.litert.importer.importer import Importer
+from export_model.converters.formats.litert.importer.importer import LiteRTImporter
 from export_model.converters.formats.litert.importer.table import TABLE
 from export_model.converters.formats.litert.schema import VERSION
 from export_model.converters.formats.litert.tensors import Tensors, damaged_error, entry_of, needed_operators
 from export_model.converters.formats.onnx.tensor_map import TENSORS_KEY, loads
-from export_model.converters.formats.saved_model.signature import ModelSignature, Tensor
-from export_model.converters.graph.builder import MAX_NODES
+from export_model.converters.formats.saved_model.signature import ModelSignature, TensorInfo
+from export_model.converters.graph.builder import MAX_BUILT_NODES
 from export_model.converters.graph.nodes import Graph, TensorShape
 from export_model.converters.graph.types import INT64
 from export_model.signatures.contract import EMBEDDED, Contract
@@ -78,13 +78,13 @@ def read_litert(data: bytes) -> LitertModel:
     if not outputs:
         raise NotAPolicyError("the model gives nothing", fix="give the model that training exported")
     operators = needed_operators(subgraph, outputs.values(), inputs.values())
-    if len(operators) > MAX_NODES:
+    if len(operators) > MAX_BUILT_NODES:
         raise NotAPolicyError(
             f"the model has {len(operators)} operators",
             why="a policy has some hundreds",
             fix="convert the policy alone",
         )
-    importer = Importer(tensors, {number: name for name, number in inputs.items()}, stored)
+    importer = LiteRTImporter(tensors, {number: name for name, number in inputs.items()}, stored)
     for operator in operators:
         code = entry_of(model, "operator_codes", operator.get("opcode_index", 0))
         importer.translate(operator, operator_of(code), TABLE)
@@ -92,9 +92,9 @@ def read_litert(data: bytes) -> LitertModel:
         importer.operand(number)
     graph = importer.graph()
 
-    def side(ports: Mapping[str, int]) -> dict[str, Tensor]:
+    def side(ports: Mapping[str, int]) -> dict[str, TensorInfo]:
         dims = {n: TensorShape(tensors.dims(n)) for n in ports.values()}
-        return {name: Tensor(importer.values[n], tensors.dtype(n), dims[n]) for name, n in ports.items()}
+        return {name: TensorInfo(importer.values[n], tensors.dtype(n), dims[n]) for name, n in ports.items()}
 
     return LitertModel(
         graph=graph,

@@ -293,7 +293,7 @@ OPERATOR_NAMES: Mapping[int, str] = {
 }
 
 
-class Field(Struct, frozen=True):
+class TableField(Struct, frozen=True):
     """A field of a table: its slot, what it holds, and what it is where the file does not say."""
 
     name: str
@@ -302,14 +302,14 @@ class Field(Struct, frozen=True):
     default: int
 
 
-def _fields(text: str) -> tuple[Field, ...]:
+def _fields(text: str) -> tuple[TableField, ...]:
     found = []
     for slot, field in enumerate(text.split()):
         name, _, kind = field.partition(":")
         kind, _, default = kind.partition("=")
         if name:
-            found.append(Field(name, slot, kind, int(default or 0)))
+            found.append(TableField(name, slot, kind, int(default or 0)))
     return tuple(found)
 
 
-TABLES: Mapping[str, tuple[Field, ...]] = {name: _fields(text) for name, text in _TABLES.items()}
+TABLES: Mapping[str, tuple[TableField, ...]] = {name: _fields(text) for name, text in _TABLES.items()}

@@ -16,7 +16,7 @@ from export_model.converters.files import tensorflow_messages as schema
 from export_model.converters.formats.checkpoint.freeze import freeze, wanted_variables
 from export_model.converters.formats.checkpoint.policy_nodes import policy_nodes
 from export_model.converters.formats.checkpoint.tensor_bundle import Extents, several
-from export_model.converters.formats.checkpoint.training_graph import Saved, TrainingGraph, training_graph
+from export_model.converters.formats.checkpoint.training_graph import SavedVariable, TrainingGraph, training_graph
 from export_model.converters.formats.live.freeze import flatten_graph
 from export_model.converters.formats.source import BUILT_BY_PYTHON, OriginalRun, SourceModel
 from export_model.converters.graph.ops.table import VARIABLES
@@ -64,7 +64,7 @@ def read_session(tensorflow: Any, session: Any, folder: Path) -> SourceModel:
     graph = training_graph(schema.parse(schema.GraphDef, data, "TensorFlow graph")).graph
     values = _values(tensorflow, session, wanted_variables(graph))
     # By the nodes' own names: what a saver in the graph calls them does not matter here.
-    places = {n.name: Saved(n.name) for n in graph.nodes if n.op in VARIABLES}
+    places = {n.name: SavedVariable(n.name) for n in graph.nodes if n.op in VARIABLES}
     frozen, notes = policy_nodes(freeze(TrainingGraph(graph, places), SessionValues(values)).graph)
     (folder / _GRAPH).write_bytes(data)
     np.savez(folder / _VALUES, *values.values())

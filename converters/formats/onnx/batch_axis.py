@@ -30,7 +30,7 @@ _MAX_FED = 1 << 23
 Dims = tuple[int | None, ...] | None
 
 
-class Reading(Struct, frozen=True):
+class ModelReading(Struct, frozen=True):
     """A model as it is read.
 
     ``batch`` is the number of rows that the file itself takes, None: any; ``alone``: it was made for one agent, and the
@@ -55,7 +55,7 @@ def read_rows(
     axes: Mapping[str, int],
     ends: Mapping[str, int],
     nodes: Sequence[Any],
-) -> Reading:
+) -> ModelReading:
     """Return the reading that is right of a model with ``nodes``.
 
     ``axes`` and ``ends`` are the batch axes of memories, by input and by output. Inputs that are handed on as they came
@@ -67,18 +67,18 @@ def read_rows(
     importer = imported(batch, False)
     if batch is None and not _static(asked):
         if not _has_baked_batch(importer, judged):
-            return Reading(importer, importer.graph(), importer.types)
+            return ModelReading(importer, importer.graph(), importer.types)
         importer, batch = imported(1, False), 1
         fault = _fault(importer, judged)
         if fault is None:
-            return Reading(importer, importer.graph(), importer.types, batch)
+            return ModelReading(importer, importer.graph(), importer.types, batch)
         try:
             return _alone(imported, declared, outputs, axes, ends, leading=True)
         except ExportModelError:
             raise fault from None
     has_rows = batch is not None and _has_rows(importer, judged)
     fault = _fault(importer, judged, said=True) if has_rows else None
-    plain = Reading(importer, importer.graph(), importer.types, batch)
+    plain = ModelReading(importer, importer.graph(), importer.types, batch)
     if has_rows and fault is None and not _broken_count(importer, outputs):
         return plain
     try:
@@ -119,7 +119,7 @@ def _alone(
     ends: Mapping[str, int],
     *,
     leading: bool,
-) -> Reading:
+) -> ModelReading:
     """The model for one agent, computed for each.
 
     ``leading``: a first axis of 1 is that of the agents. Raises UnsupportedOpError where it cannot be.
@@ -136,7 +136,7 @@ def _alone(
     graph = for_every_row(importer.graph(), [importer.values[name] for name in made], inputs, last)
     unread = [n for n in importer.nodes if n.op == "Placeholder" and n.name not in graph]
     graph = Graph((*graph.nodes, *unread))
-    return Reading(importer, graph, infer_types(graph), 1, alone=True)
+    return ModelReading(importer, graph, infer_types(graph), 1, alone=True)
 
 
 def _imported_outputs(importer: Importer, outputs: Sequence[Any]) -> list[str]:

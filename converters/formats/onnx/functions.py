@@ -13,7 +13,7 @@ from export_model.converters.formats.onnx.importer.node import STANDARD
 from export_model.converters.formats.onnx.importer.table import TABLE
 from export_model.converters.formats.onnx.messages import as_onnx_message
 from export_model.converters.formats.onnx.proto import bodies
-from export_model.converters.graph.builder import MAX_NODES
+from export_model.converters.graph.builder import MAX_BUILT_NODES
 from export_model.signatures.errors import DamagedFileError, UnsupportedOpError
 
 #: Opsets that are read. Before 7 broadcasting was an attribute of each op.
@@ -155,9 +155,9 @@ class _Unfolding:
         for node in body.node:
             name = _identity(node, node.op_type)
             load.add(self._call(node, name, within) if name in self.functions else self._plain(node, within))
-            if load.nodes > MAX_NODES or load.bytes > self.most:
+            if load.nodes > MAX_BUILT_NODES or load.bytes > self.most:
                 raise UnsupportedOpError(
-                    f"the model's functions unfold to more than {MAX_NODES} nodes, or to more bytes than a policy has",
+                    f"its functions unfold to more than {MAX_BUILT_NODES} nodes, or more bytes than a policy has",
                     issues=[(node.name, node.op_type)],
                     why="a policy has some hundreds of nodes",
                     fix="give the policy alone, without the training part",

@@ -14,7 +14,7 @@ from typing import Any
 from msgspec import Struct, field
 
 from export_model.converters.formats.onnx.importer.node import STANDARD
-from export_model.converters.policy.rules import Decision, Rule, always, first
+from export_model.converters.policy.rules import RoleDecision, Rule, always, first
 from export_model.signatures.roles import Role
 
 Dims = tuple[int | None, ...] | None
@@ -82,7 +82,7 @@ class FoundMemories(Struct, frozen=True):
 
     memories: tuple[OnnxMemory, ...] = ()
     axes: Mapping[str, int] = field(default_factory=dict)
-    decisions: Mapping[str, Decision] = field(default_factory=dict)
+    decisions: Mapping[str, RoleDecision] = field(default_factory=dict)
 
 
 def separate_memories(
@@ -99,7 +99,7 @@ def separate_memories(
     for name, start in starts.items():
         rule = first(_RULES, start)
         assert rule is not None
-        decisions[name] = Decision(name, rule.role, rule.says)
+        decisions[name] = RoleDecision(name, rule.role, rule.says)
         if rule.role is not None and start.axis is not None:
             memories.append(OnnxMemory(name, start.ends[0], start.parts.pop(), start.axis))
     axes = {name: start.axis for name, start in starts.items() if start.axis is not None}

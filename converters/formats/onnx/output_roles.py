@@ -10,7 +10,7 @@ from msgspec import Struct
 from export_model.converters.formats.onnx.reader import OnnxModel
 from export_model.converters.graph.types import Dim
 from export_model.converters.policy.action_values import is_q_name, is_scores
-from export_model.converters.policy.rules import Decision, Rule, against, first
+from export_model.converters.policy.rules import RoleDecision, Rule, against, first
 from export_model.signatures.roles import OUTPUT_NAMES, STATE_VALUE_NAMES, Role
 
 #: What other trainers call the action and the value: rsl_rl (actions), Stable-Baselines3, CleanRL, plain PyTorch.
@@ -90,19 +90,19 @@ _BY_ORDER = "it is the {} of outputs without names, as Stable-Baselines3's polic
 _UNNAMED = "its name is none that trainers give"
 
 
-def output_roles(model: OnnxModel) -> dict[str, Decision]:
+def output_roles(model: OnnxModel) -> dict[str, RoleDecision]:
     """Output node → its role, by the names that other trainers use; by position where no name says anything."""
     nodes = [*model.outputs.values()]
     if positional(model):
         places = ((Role.ACTION, "first"), (Role.VALUE, "second"), (Role.LOG_PROB, "third"))
         ordered = zip(nodes, places, strict=False)
-        return {n: Decision(n, role, _BY_ORDER.format(place)) for n, (role, place) in ordered}
+        return {n: RoleDecision(n, role, _BY_ORDER.format(place)) for n, (role, place) in ordered}
     outputs = {n: Output(n, _base(n), tuple(model.shapes.get(n) or ())) for n in nodes}
     found = {n: _by(_BY_NAME, o) for n, o in outputs.items()}
     values = _of(found, Role.Q_VALUES)
     if len(values) > 1:
         several = "several outputs are called as values of actions"
-        found |= {n: Decision(n, None, several, (found[n].says,)) for n in values}
+        found |= {n: RoleDecision(n, None, several, (found[n].says,)) for n in values}
     actions = _of(found, Role.ACTION)
     if len(actions) > 1:  # beside one that is called so, a mean or logits are what it was made of
         actions = _plainest(found, [outputs[n] for n in actions])
@@ -111,27 +111,27 @@ def output_roles(model: OnnxModel) -> dict[str, Decision]:
         return found
     if len(actions) != 1:  # none, or more than one: names and structure decide, or ask
         said = "several outputs are called as actions" if actions else "no output is called as an action"
-        return {n: Decision(n, None, said, (d.says,) if d.role else d.against) for n, d in found.items()}
+        return {n: RoleDecision(n, None, said, (d.says,) if d.role else d.against) for n, d in found.items()}
     width = outputs[actions[0]].shape[1:]
     for node in [n for n, d in found.items() if d.role is None]:
         rule = first(_BESIDE, Output(node, outputs[node].base, outputs[node].shape, width))
         if rule is not None:
-            found[node] = Decision(node, rule.role, rule.says)
+            found[node] = RoleDecision(node, rule.role, rule.says)
     return found
 
 
-def _by(rules: _Rules, output: Output) -> Decision:
+def _by(rules: _Rules, output: Output) -> RoleDecision:
     rule = first(rules, output)
     if rule is None:
-        return Decision(output.node, None, _UNNAMED)
-    return Decision(output.node, rule.role, rule.says, against(rules, output, rule.role))
+        return RoleDecision(output.node, None, _UNNAMED)
+    return RoleDecision(output.node, rule.role, rule.says, against(rules, output, rule.role))
 
 
-def _of(found: dict[str, Decision], role: Role) -> list[str]:
+def _of(found: dict[str, RoleDecision], role: Role) -> list[str]:
     return [n for n, d in found.items() if d.role is role]
 
 
-def _plainest(found: dict[str, Decision], outputs: Sequence[Output]) -> list[str]:
+def _plainest(found: dict[str, RoleDecision], outputs: Sequence[Output]) -> list[str]:
     """The action among several that are called so, which makes the others none; all where it is not plain."""
     for rule in _PLAINEST:
         fitting = [o.node for o in outputs if rule.when(o)]
@@ -139,7 +139,7 @@ def _plainest(found: dict[str, Decision], outputs: Sequence[Output]) -> list[str
             for node in (o.node for o in outputs):
                 decided = node == fitting[0]
                 said = rule.says if decided else f"the action is {fitting[0]}, of which {rule.says}"
-                found[node] = Decision(
+                found[node] = RoleDecision(
                     node, rule.role if decided else None, said, () if decided else (found[node].says,)
                 )
             return fitting

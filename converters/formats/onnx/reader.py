@@ -13,7 +13,7 @@ from msgspec.structs import replace
 
 from export_model.converters.files.external_data import Detached
 from export_model.converters.files.fetch import Fetched
-from export_model.converters.formats.onnx.batch_axis import Reading, dims_of, read_rows
+from export_model.converters.formats.onnx.batch_axis import ModelReading, dims_of, read_rows
 from export_model.converters.formats.onnx.exporters import repair_model
 from export_model.converters.formats.onnx.functions import all_nodes, inline_functions, opsets_of
 from export_model.converters.formats.onnx.half_precision import widen
@@ -25,7 +25,7 @@ from export_model.converters.formats.onnx.proto import array_of, decode_model, l
 from export_model.converters.graph.nodes import Graph, TensorShape
 from export_model.converters.graph.types import BATCH, Dim, TensorType
 from export_model.converters.policy.memories import looks_like_state
-from export_model.converters.policy.rules import Decision
+from export_model.converters.policy.rules import RoleDecision
 from export_model.signatures.errors import DamagedFileError, NotAPolicyError, UnsupportedOpError
 from export_model.signatures.memories import SeparateMemory
 from export_model.signatures.roles import ACTION_NAMES, CONSTANT_NAMES
@@ -74,7 +74,7 @@ class OnnxModel(Struct, frozen=True):
     #: what the graph is called
     name: str = ""
     #: node → what was decided of an input that a recurrent layer begins with
-    decisions: Mapping[str, Decision] = field(default_factory=dict)
+    decisions: Mapping[str, RoleDecision] = field(default_factory=dict)
 
 
 def read_onnx(given: Fetched, repair: str | None = None) -> OnnxModel:
@@ -184,7 +184,9 @@ def _memories(graph: Any, declared: Sequence[Any]) -> FoundMemories:
     )
 
 
-def _joint(reading: Reading, memories: Sequence[OnnxMemory], outputs: Mapping[str, str]) -> tuple[SeparateMemory, ...]:
+def _joint(
+    reading: ModelReading, memories: Sequence[OnnxMemory], outputs: Mapping[str, str]
+) -> tuple[SeparateMemory, ...]:
     """The memories by nodes; empty where one of them could not be made."""
     if any(m.output not in outputs for m in memories):
         return ()

@@ -12,7 +12,7 @@ from export_model.converters.files.chunks import Pieces
 from export_model.converters.formats.format import WriteOptions
 from export_model.converters.formats.programs.comment import escape, interface_lines
 from export_model.converters.formats.programs.members import Field, Header, header_of
-from export_model.converters.formats.programs.weights import Weights, weights_name, weights_of
+from export_model.converters.formats.programs.weights import ProgramWeights, weights_name, weights_of
 from export_model.converters.graph.ops.table import traits
 from export_model.converters.graph.printer import Printer
 from export_model.converters.graph.program import Program, program_of
@@ -56,7 +56,7 @@ class Plan(Struct, frozen=True):
     sizes: tuple[int, ...]
     checked: tuple[Field, ...]
     golden: tuple[float, ...]
-    weights: Weights
+    weights: ProgramWeights
     code: CodeOptions
     guarded: tuple[Guarded, ...] = ()
 

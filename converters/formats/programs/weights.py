@@ -48,7 +48,7 @@ class Kept(Struct, frozen=True, eq=False):
         return int(np.prod(self.narrow.value.shape[self.axis + 1 :], dtype=np.int64))
 
 
-class Weights(Struct, frozen=True, eq=False):
+class ProgramWeights(Struct, frozen=True, eq=False):
     """All constants of a program, in its order, and the file (None: they are in the source)."""
 
     kept: tuple[Kept, ...]
@@ -61,7 +61,7 @@ class Weights(Struct, frozen=True, eq=False):
         return zlib.crc32(self.file or b"")
 
 
-def weights_of(program: Program, storage: Storage, *, in_file: bool) -> Weights:
+def weights_of(program: Program, storage: Storage, *, in_file: bool) -> ProgramWeights:
     """The constants of a program. Numbers stay the same: only what comes back from fewer bytes takes fewer."""
     made, content = list[Kept](), bytearray()
     given = {id(t.place) for t in program.outputs.values()}
@@ -76,7 +76,7 @@ def weights_of(program: Program, storage: Storage, *, in_file: bool) -> Weights:
                 content += part.value.astype(part.dtype.newbyteorder("<")).tobytes()
             kept = Kept(kept.place, kept.narrow, kept.step, kept.axis, tuple(offsets))
         made.append(kept)
-    return Weights(tuple(made), bytes(content) if in_file else None, {id(k.place): k for k in made})
+    return ProgramWeights(tuple(made), bytes(content) if in_file else None, {id(k.place): k for k in made})
 
 
 def _parts(kept: Kept) -> Iterator[Place]:
@@ -112,7 +112,7 @@ def _channel(kept: Kept, x: Element) -> Expression:
     return apply("mod", flat, number(kept.step.size))
 
 
-def widen_where_used(program: Program, weights: Weights) -> Program:
+def widen_where_used(program: Program, weights: ProgramWeights) -> Program:
     """Return a program that reads its constants as they are kept: a cast, and a step's length, at each element."""
     stages = []
     for stage in program.stages:

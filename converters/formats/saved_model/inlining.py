@@ -30,7 +30,7 @@ from export_model.signatures.errors import DamagedFileError, NotAPolicyError
 _ALLOWED = COMPUTING | READS | ORDERING | CALLING
 _BOOL = 10  # DataType
 #: Copies of a graph's functions may hold this many nodes, and bytes: a small file could unfold to any size otherwise.
-MAX_NODES = 1 << 15
+MAX_INLINED_NODES = 1 << 15
 _BYTES_FREE, _BYTES_FACTOR = 1 << 26, 4
 #: What a tensor that is handed to a function or back is charged.
 _PASSED = 1 << 8
@@ -87,7 +87,7 @@ class _Flattening:
         self.result.versions.CopyFrom(graph_def.versions)
         #: a call's result → the tensor that it is
         self.aliases: dict[str, str] = {}
-        self.places_left = MAX_NODES
+        self.places_left = MAX_INLINED_NODES
         self.bytes_left = _BYTES_FREE + _BYTES_FACTOR * int(graph_def.ByteSize())
 
     def run(self, roots: Sequence[str]) -> Flat:
@@ -177,7 +177,7 @@ class _Flattening:
         if self.places_left < 0 or self.bytes_left < 0:
             raise NotAPolicyError(
                 "the SavedModel's functions unfold to more nodes or constants than a policy has",
-                why=f"more than {MAX_NODES} nodes, or more than {_BYTES_FACTOR} times the size of the graph",
+                why=f"more than {MAX_INLINED_NODES} nodes, or more than {_BYTES_FACTOR} times the size of the graph",
                 fix="save the policy alone, without the training part",
             )
 

@@ -14,7 +14,7 @@ from msgspec import Struct, field
 from export_model.converters.compiler.options import MAX_PORTS
 from export_model.converters.files import tensorflow_messages as schema
 from export_model.converters.files.external_data import Detached
-from export_model.converters.formats.saved_model.signature import ModelSignature, Tensor
+from export_model.converters.formats.saved_model.signature import ModelSignature, TensorInfo
 from export_model.converters.graph.nodes import TensorShape, node_of, reachable
 from export_model.converters.graph.ops.table import CALLING
 from export_model.signatures.errors import DamagedFileError, NotAPolicyError
@@ -23,7 +23,7 @@ SERVING = "serving_default"
 _INIT = "__saved_model_"
 
 
-class Saved(Struct, frozen=True):
+class SavedMetaGraph(Struct, frozen=True):
     """One MetaGraph of a SavedModel, and the signature that stands for the policy."""
 
     graph_def: Any
@@ -39,7 +39,7 @@ class Saved(Struct, frozen=True):
     detached: Detached = field(default_factory=Detached)
 
 
-def read_saved_model(data: bytes, key: str | None = None, detached: Detached | None = None) -> Saved:
+def read_saved_model(data: bytes, key: str | None = None, detached: Detached | None = None) -> SavedMetaGraph:
     """The MetaGraph that is tagged for serving (else the first), and its signature ``key``.
 
     Without a key it is ``serving_default``, else the first. Large contents go to ``detached``, by default one of
@@ -65,7 +65,7 @@ def read_saved_model(data: bytes, key: str | None = None, detached: Detached | N
         signature = ModelSignature(_tensors(definition.inputs), _tensors(definition.outputs), key)
     calls = _calls_functions(meta.graph_def, signature)
     restore = meta.saver_def.restore_op_name
-    return Saved(
+    return SavedMetaGraph(
         graph_def=meta.graph_def,
         tags=tuple(meta.meta_info_def.tags),
         signature=signature,
@@ -76,15 +76,17 @@ def read_saved_model(data: bytes, key: str | None = None, detached: Detached | N
     )
 
 
-def _tensors(entries: Mapping[str, Any]) -> dict[str, Tensor]:
-    found: dict[str, Tensor] = {}
+def _tensors(entries: Mapping[str, Any]) -> dict[str, TensorInfo]:
+    found: dict[str, TensorInfo] = {}
     for key in sorted(entries):
         info = entries[key]
         if not info.name:
             raise DamagedFileError(f"the signature's {key!r} names no tensor", fix="save the model again, dense")
         shape = info.tensor_shape
         dims = tuple(None if d.size < 0 else int(d.size) for d in shape.dim)
-        found[key] = Tensor(info.name, schema.dtype_of(info.dtype), TensorShape(None if shape.unknown_rank else dims))
+        found[key] = TensorInfo(
+            info.name, schema.dtype_of(info.dtype), TensorShape(None if shape.unknown_rank else dims)
+        )
     return found
 
 

@@ -46,7 +46,7 @@ _Q_VALUES = CANONICAL[Role.Q_VALUES]
 _NUMBERS = frozenset(t.dtype.name for t in DATA_TYPES)
 
 
-class Tensor(Struct, frozen=True):
+class TensorInfo(Struct, frozen=True):
     """One entry of a signature."""
 
     name: str
@@ -57,8 +57,8 @@ class Tensor(Struct, frozen=True):
 class ModelSignature(Struct, frozen=True):
     """Key → tensor of the inputs and of the outputs; ``key`` is what the signature itself is called."""
 
-    inputs: Mapping[str, Tensor] = field(default_factory=dict)
-    outputs: Mapping[str, Tensor] = field(default_factory=dict)
+    inputs: Mapping[str, TensorInfo] = field(default_factory=dict)
+    outputs: Mapping[str, TensorInfo] = field(default_factory=dict)
     key: str | None = None
 
     @property
@@ -79,7 +79,7 @@ def signature_of(inputs: Mapping[str, Any], outputs: Mapping[str, Any], key: str
     """What TensorFlow says of a function that it froze: each tensor's name, dtype, and shape or None."""
     inward, outward = (
         {
-            k: Tensor(name, _numbers(kind), TensorShape(None if shape is None else tuple(shape)))
+            k: TensorInfo(name, _numbers(kind), TensorShape(None if shape is None else tuple(shape)))
             for k, (name, kind, shape) in side.items()
         }
         for side in (inputs, outputs)
@@ -254,14 +254,14 @@ def fed_by_signature(graph_def: Any, signature: ModelSignature) -> Any:
     return graph_def
 
 
-def _role(graph: Graph, key: str, tensor: Tensor) -> Role | None:
+def _role(graph: Graph, key: str, tensor: TensorInfo) -> Role | None:
     node = graph.get(node_of(tensor.name))
     if node is None or split_ref(tensor.name)[1]:
         return None
     return role_by_name(key, node)
 
 
-def _has_several_columns(tensor: Tensor) -> bool:
+def _has_several_columns(tensor: TensorInfo) -> bool:
     """Whether a tensor is floats [B, n], n above 1, as far as the signature says."""
     dims, dtype = tensor.shape.dims, tensor.dtype
     return (dtype is None or dtype.kind == "f") and (dims is None or (len(dims) == 2 and dims[1] != 1))

@@ -13,14 +13,14 @@ from export_model.converters.files.fetch import Fetched, read_bytes
 from export_model.converters.files.file_probe import Content
 from export_model.converters.formats.checkpoint.freeze import freeze, with_values
 from export_model.converters.formats.checkpoint.tensor_bundle import Checkpoint
-from export_model.converters.formats.checkpoint.training_graph import Saved as Place
+from export_model.converters.formats.checkpoint.training_graph import SavedVariable as Place
 from export_model.converters.formats.checkpoint.training_graph import TrainingGraph, saved_places, training_graph
 from export_model.converters.formats.embed import contract_text, facts_of, split_contract
 from export_model.converters.formats.frozen_graph.reader import from_graph_def
 from export_model.converters.formats.frozen_graph.source import read as read_frozen
 from export_model.converters.formats.saved_model.inlining import flat
 from export_model.converters.formats.saved_model.lengths import without_counted
-from export_model.converters.formats.saved_model.reader import Saved, read_saved_model
+from export_model.converters.formats.saved_model.reader import SavedMetaGraph, read_saved_model
 from export_model.converters.formats.saved_model.signature import ModelSignature, expose_signature, fed_by_signature
 from export_model.converters.formats.source import OriginalRun, ReadOptions, SourceModel
 from export_model.converters.graph.nodes import Graph, node_of
@@ -76,7 +76,7 @@ def values_beside(folder: Path) -> Checkpoint | None:
     return Checkpoint(prefix) if prefix.with_name("variables.index").is_file() else None
 
 
-def frozen_model(saved: Saved, checkpoint: Checkpoint | None) -> FrozenModel:
+def frozen_model(saved: SavedMetaGraph, checkpoint: Checkpoint | None) -> FrozenModel:
     """What a signature computes, flat and frozen. Raises NotAPolicyError, DamagedFileError, GraphError."""
     detached = saved.detached
     training, signature = (
@@ -90,7 +90,7 @@ def frozen_model(saved: Saved, checkpoint: Checkpoint | None) -> FrozenModel:
     return FrozenModel(frozen.graph, definition, signature, () if checkpoint is None else checkpoint.files)
 
 
-def _inline_signature(saved: Saved) -> tuple[TrainingGraph, ModelSignature]:
+def _inline_signature(saved: SavedMetaGraph) -> tuple[TrainingGraph, ModelSignature]:
     """The graph that the signature's functions are, and the signature on it; its inputs are called as their keys.
 
     Which tensor of ``variables/`` is a variable's value is said by the function that restores them.
@@ -118,7 +118,7 @@ def _inline_signature(saved: Saved) -> tuple[TrainingGraph, ModelSignature]:
     return training, flat_signature
 
 
-def _notes(saved: Saved) -> tuple[str, ...]:
+def _notes(saved: SavedMetaGraph) -> tuple[str, ...]:
     others = [k for k in saved.keys if k != saved.signature.key]
     if not others:
         return ()

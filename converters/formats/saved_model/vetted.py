@@ -16,7 +16,7 @@ from export_model.converters.files import tensorflow_messages as schema
 from export_model.converters.files.external_data import Detached
 from export_model.converters.files.fetch import read_bytes
 from export_model.converters.formats.saved_model.reader import read_saved_model
-from export_model.converters.formats.saved_model.signature import Tensor
+from export_model.converters.formats.saved_model.signature import TensorInfo
 from export_model.converters.formats.saved_model.source import FILE, frozen_model, values_beside
 from export_model.converters.formats.saved_model.variables import files_of
 from export_model.converters.formats.saved_model.writer import METHOD
@@ -75,7 +75,7 @@ def _prefix_nodes(part: Any, prefix: str) -> list[Any]:
     return nodes
 
 
-def _fill(info: Any, tensor: Tensor) -> None:
+def _fill(info: Any, tensor: TensorInfo) -> None:
     """A TensorInfo of a signature's entry."""
     info.name = tensor.name if ":" in tensor.name else f"{tensor.name}:0"
     if tensor.dtype is not None:

@@ -21,7 +21,7 @@ from msgspec import Struct
 from export_model.converters.files import tensorflow_messages as schema
 from export_model.converters.files.fetch import Fetched, inside, read_bytes
 from export_model.converters.files.file_probe import json_in
-from export_model.converters.formats.saved_model.signature import ModelSignature, Tensor
+from export_model.converters.formats.saved_model.signature import ModelSignature, TensorInfo
 from export_model.converters.graph.nodes import Graph, Node, TensorShape, normal_ref, topological
 from export_model.converters.graph.ops.table import IFS, WHILES, is_fed
 from export_model.signatures.errors import DamagedFileError, NotAPolicyError, SourceError
@@ -295,9 +295,9 @@ _VALUES: Mapping[str, Callable[[Any], Any]] = {
 
 
 def _signature(value: Mapping[str, Any]) -> ModelSignature:
-    def tensor(info: Mapping[str, Any]) -> Tensor:
+    def tensor(info: Mapping[str, Any]) -> TensorInfo:
         dtype = _dtype(info["dtype"]) if "dtype" in info else None
-        return Tensor(str(info["name"]), dtype, _shape(info.get("tensorShape") or {"unknownRank": True}))
+        return TensorInfo(str(info["name"]), dtype, _shape(info.get("tensorShape") or {"unknownRank": True}))
 
     inputs, outputs = (
         {key: tensor(info) for key, info in (value.get(side) or {}).items()} for side in ("inputs", "outputs")

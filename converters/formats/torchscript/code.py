@@ -15,7 +15,7 @@ from export_model.signatures.errors import DamagedFileError, SourceError
 _DAMAGED = "copy or download it again"
 
 
-class Code:
+class ArchiveCode:
     """The classes and functions of an archive, by their dotted names."""
 
     def __init__(self, files: Mapping[str, str]) -> None:

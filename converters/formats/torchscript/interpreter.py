@@ -13,10 +13,10 @@ from typing import Any
 
 from msgspec import Struct
 
-from export_model.converters.formats.torchscript.code import Code
+from export_model.converters.formats.torchscript.code import ArchiveCode
 from export_model.converters.formats.torchscript.machine import Machine
 from export_model.converters.formats.torchscript.ops.table import OPS
-from export_model.converters.formats.torchscript.values import Module, Named, Tensor
+from export_model.converters.formats.torchscript.values import Module, Named, ScriptTensor
 from export_model.signatures.errors import DamagedFileError, ExportModelError, SourceError, UnsupportedOpError
 
 #: Statements that are walked through; a policy has some hundreds, loops included.
@@ -48,7 +48,7 @@ class _ReturnError(Exception):
 class Interpreter:
     """One walk through a program; ``budget`` counts the statements of all walks."""
 
-    def __init__(self, code: Code, machine: Machine, constants: Sequence[Any], budget: Iterator[int]) -> None:
+    def __init__(self, code: ArchiveCode, machine: Machine, constants: Sequence[Any], budget: Iterator[int]) -> None:
         self._code, self._machine, self._constants = code, machine, constants
         self._budget = budget
         self._level = 0
@@ -132,7 +132,7 @@ class Interpreter:
 
     def _set_attribute(self, owner: Any, name: str, value: Any) -> None:
         known = self.attribute_of(owner, name) if isinstance(owner, Module) else None
-        if isinstance(known, Tensor) and isinstance(value, Tensor):
+        if isinstance(known, ScriptTensor) and isinstance(value, ScriptTensor):
             self._machine.overwrite(known, value)
         elif not isinstance(owner, Module) or known is not value:
             raise _refusal(f"the attribute {name[:60]} is set, and is not a tensor of one shape")
@@ -255,7 +255,7 @@ class Interpreter:
     def _in_place(self, name: str, op: Callable[..., Any], given: Sequence[Any], named: Mapping[str, Any]) -> Any:
         """Return the first operand, with what an op gives put into it."""
         made = self._apply(name, op, given, named)
-        if not given or not isinstance(given[0], Tensor) or not isinstance(made, Tensor):
+        if not given or not isinstance(given[0], ScriptTensor) or not isinstance(made, ScriptTensor):
             raise _refusal(f"the op {name[:80]} on something that is not a tensor")
         self._machine.overwrite(given[0], made)
         return given[0]

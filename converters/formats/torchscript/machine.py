@@ -12,7 +12,7 @@ import numpy as np
 from export_model.converters.files import unpickle
 from export_model.converters.files.pickled_objects import Instance
 from export_model.converters.files.torchscript_archive import ScriptArchive
-from export_model.converters.formats.torchscript.values import LengthFoundError, Module, ShapeFoundError, Tensor
+from export_model.converters.formats.torchscript.values import LengthFoundError, Module, ScriptTensor, ShapeFoundError
 from export_model.converters.graph.builder import Builder
 from export_model.converters.graph.nodes import NameScope, Node
 from export_model.converters.graph.types import BOOL, FLOAT32, INT32, INT64
@@ -49,7 +49,7 @@ class Machine:
         self._archive = archive
         self._open: dict[str, tuple[int, int]] = {}
         self._inputs: dict[str, int] = {}
-        self._buffers: dict[str, Tensor] = {}
+        self._buffers: dict[str, ScriptTensor] = {}
         self._names: dict[str, str] = {}
         self._places: dict[str, tuple[str, int]] = {}
         self._first: dict[str, np.ndarray] = {}
@@ -81,18 +81,20 @@ class Machine:
 
     # ------------------------------------------------------------------ inputs and memory
 
-    def input(self, name: str, number: int, shape: Sequence[int | None], dtype: np.dtype[Any] = FLOAT32) -> Tensor:
+    def input(
+        self, name: str, number: int, shape: Sequence[int | None], dtype: np.dtype[Any] = FLOAT32
+    ) -> ScriptTensor:
         """Return an input of the program; what its open axes turn out to be is raised as LengthFoundError."""
         reference = self.b.named_input(name, dtype, shape, name)
         for axis, length in enumerate(self.b.shape(reference)):
             if isinstance(length, str):
                 self._open[length] = number, axis
                 self._inputs[reference] = number
-        return Tensor(reference)
+        return ScriptTensor(reference)
 
-    def state(self, name: str) -> Tensor:
+    def state(self, name: str) -> ScriptTensor:
         """Return an input that is a part of the memory, as the step begins."""
-        return Tensor(self._start[name])
+        return ScriptTensor(self._start[name])
 
     def place_of(self, symbol: str) -> tuple[int, int]:
         """Return the input and its axis that an open length is of. Raises SourceError where it is of none."""
@@ -105,15 +107,19 @@ class Machine:
 
         ``given`` is what its ``forward`` takes: a batch of histories, and states [layers, 1, hidden].
         """
-        if not _RECURRENT.fullmatch(layer.type_name) or len(given) != _LAYER_INPUTS or not isinstance(given[0], Tensor):
+        if (
+            not _RECURRENT.fullmatch(layer.type_name)
+            or len(given) != _LAYER_INPUTS
+            or not isinstance(given[0], ScriptTensor)
+        ):
             return
         states = given[1] if isinstance(given[1], list | tuple) else [given[1]]
         kernel = self.attribute(layer, "weight_hh_l0")
-        if self.b.rank(given[0].read()) != _STATE_AXES or not isinstance(kernel, Tensor):
+        if self.b.rank(given[0].read()) != _STATE_AXES or not isinstance(kernel, ScriptTensor):
             return
         layers = sum(name.startswith("weight_hh_l") for name in layer.instance.state)
         shape = (layers, 1, self.b.length(kernel.read(), 1))
-        for state in (s.read() for s in states if isinstance(s, Tensor)):
+        for state in (s.read() for s in states if isinstance(s, ScriptTensor)):
             if self.b.rank(state) != _STATE_AXES and state in self._inputs:
                 raise ShapeFoundError(self._inputs[state], shape)
 
@@ -188,24 +194,24 @@ class Machine:
             raise DamagedFileError(f"the attribute {name[:60]} has lists in one another", fix="give it again")
         if isinstance(value, Instance):
             return Module(value, name)
-        if isinstance(value, unpickle.Tensor):
+        if isinstance(value, unpickle.PickledTensor):
             return self._buffer(value, name, place)
         if isinstance(value, list | tuple):
             made = [self._value(v, f"{name}.{i}", place, depth + 1) for i, v in enumerate(value)]
             return made if isinstance(value, list) else tuple(made)
         return value if isinstance(value, bool | int | float | str) else None
 
-    def _buffer(self, value: unpickle.Tensor, name: str, place: tuple[str, int]) -> Tensor:
+    def _buffer(self, value: unpickle.PickledTensor, name: str, place: tuple[str, int]) -> ScriptTensor:
         """Return the cell of a tensor in the file; the same for all names of it."""
         key = repr((getattr(value.storage, "key", ""), value.offset, value.shape, value.strides))
         if key not in self._buffers:
             self._first[key] = self._array(value, name)
             reference = self._start.get(key) or self.b.const(self._first[key], name.rpartition(".")[2])
-            self._buffers[key] = Tensor(reference, key)
+            self._buffers[key] = ScriptTensor(reference, key)
             self._names[key], self._places[key] = name, place
         return self._buffers[key]
 
-    def _array(self, value: unpickle.Tensor, name: str) -> np.ndarray:
+    def _array(self, value: unpickle.PickledTensor, name: str) -> np.ndarray:
         array = self._archive.array(value, name)
         if array.dtype.kind == "f":
             self.narrowed |= array.dtype == np.float64 and array.ndim > 0
@@ -218,7 +224,7 @@ class Machine:
 
     def truth(self, value: Any) -> bool:
         """Return what a condition says. Raises SourceError where it depends on what is fed."""
-        if isinstance(value, Tensor):
+        if isinstance(value, ScriptTensor):
             known = self.b.constant(value.read())
             if known is None or known.size != 1:
                 raise SourceError(
@@ -239,7 +245,7 @@ class Machine:
 
     def ref(self, value: Any, like: str | None = None) -> str:
         """Return a tensor of the graph; a number becomes one, of the dtype of ``like`` where that can hold it."""
-        if isinstance(value, Tensor):
+        if isinstance(value, ScriptTensor):
             return value.read()
         if isinstance(value, bool):
             return self.b.const(np.array(value))
@@ -254,7 +260,7 @@ class Machine:
 
     def pair(self, left: Any, right: Any) -> tuple[str, str]:
         """Return two operands in one dtype, as PyTorch promotes them; an open length is told by the other's."""
-        like = next((v.read() for v in (left, right) if isinstance(v, Tensor)), None)
+        like = next((v.read() for v in (left, right) if isinstance(v, ScriptTensor)), None)
         a, b = self.ref(left, like), self.ref(right, like)
         kinds = [self.b.dtype(r) for r in (a, b)]
         if kinds[0] != kinds[1]:
@@ -273,11 +279,11 @@ class Machine:
 
     def constant_numbers(self, value: Any, meaning: str) -> np.ndarray:
         """Return the numbers of a tensor that is the same in every run: a weight. Raises UnsupportedOpError."""
-        if not isinstance(value, Tensor):
+        if not isinstance(value, ScriptTensor):
             raise UnsupportedOpError(f"{meaning} must be a tensor", why="a weight is expected")
         return self.b.needed_constant(value.read(), meaning)
 
-    def overwrite(self, target: Tensor, made: Tensor) -> None:
+    def overwrite(self, target: ScriptTensor, made: ScriptTensor) -> None:
         """Put a tensor in another's place. Raises UnsupportedOpError where it does not fit there."""
         before, after = target.read(), made.read()
         self.meet(before, after)

@@ -19,12 +19,12 @@ from export_model.converters.files.fetch import Fetched
 from export_model.converters.files.pickled_objects import Instance
 from export_model.converters.files.torch_archive import Storage
 from export_model.converters.files.torchscript_archive import ScriptArchive
-from export_model.converters.files.unpickle import Tensor as Stored
+from export_model.converters.files.unpickle import PickledTensor as Stored
 from export_model.converters.formats.source import ReadOptions, SourceModel
-from export_model.converters.formats.torchscript.code import Code
+from export_model.converters.formats.torchscript.code import ArchiveCode
 from export_model.converters.formats.torchscript.interpreter import Interpreter
 from export_model.converters.formats.torchscript.machine import MEMORY_IN, MEMORY_OUT, Machine
-from export_model.converters.formats.torchscript.values import LengthFoundError, Module, ShapeFoundError, Tensor
+from export_model.converters.formats.torchscript.values import LengthFoundError, Module, ScriptTensor, ShapeFoundError
 from export_model.converters.graph.types import FLOAT32
 from export_model.converters.policy.facts import DOUBLES_NARROWED, SourceFacts
 from export_model.converters.policy.memories import part_of, stem_of
@@ -61,7 +61,7 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
     archive = ScriptArchive(given.data)
     if not isinstance(archive.value, Instance):
         raise NotAPolicyError("holds no module", why="torch.jit.save writes one", fix="give the module itself")
-    module, code = Module(archive.value), Code(archive.code)
+    module, code = Module(archive.value), ArchiveCode(archive.code)
     names = _inputs(code.method(module.type_name, _FORWARD))
     inputs = _given_inputs(names, archive.traced, options.sensors)
     memory: Memory = {}
@@ -109,7 +109,7 @@ def _inputs(forward: ast.FunctionDef) -> list[str]:
     parameters = forward.args.args[1:]
     needed = parameters[: len(parameters) - len(forward.args.defaults)]
     for parameter in needed:
-        if not isinstance(parameter.annotation, ast.Name) or parameter.annotation.id != "Tensor":
+        if not isinstance(parameter.annotation, ast.Name) or parameter.annotation.id != "ScriptTensor":
             raise SourceError(
                 f"its input {parameter.arg[:60]} is not a tensor",
                 why="a policy is fed tensors",
@@ -155,7 +155,7 @@ def _for_one_agent(shape: tuple[int, ...], rows: int, dtype: np.dtype[Any], *, f
     return (1, *shape[1:])
 
 
-def _states(machine: Machine, inputs: Sequence[_Input], outputs: Sequence[Tensor]) -> Sequence[_Input]:
+def _states(machine: Machine, inputs: Sequence[_Input], outputs: Sequence[ScriptTensor]) -> Sequence[_Input]:
     """The inputs that are given back: the last of them, where all outputs but the first have their shapes in order."""
     count = len(outputs) - 1
     if not 0 < count < len(inputs):
@@ -169,10 +169,10 @@ def _lengths_of(shape: Shape) -> tuple[int, ...]:
     return tuple(length for length in shape if length is not None)
 
 
-def _outputs(result: Any) -> list[Tensor]:
+def _outputs(result: Any) -> list[ScriptTensor]:
     """What forward gives. Raises NotAPolicyError."""
-    outputs = [result] if isinstance(result, Tensor) else list(result) if isinstance(result, tuple) else []
-    if not outputs or not all(isinstance(o, Tensor) for o in outputs):
+    outputs = [result] if isinstance(result, ScriptTensor) else list(result) if isinstance(result, tuple) else []
+    if not outputs or not all(isinstance(o, ScriptTensor) for o in outputs):
         raise NotAPolicyError(
             f"its forward gives a {type(result).__name__}", why="an action is a tensor", fix="give a policy"
         )
@@ -180,7 +180,7 @@ def _outputs(result: Any) -> list[Tensor]:
 
 
 def _model(
-    given: Fetched, machine: Machine, outputs: Sequence[Tensor], memory: Memory, inputs: Sequence[_Input]
+    given: Fetched, machine: Machine, outputs: Sequence[ScriptTensor], memory: Memory, inputs: Sequence[_Input]
 ) -> SourceModel:
     machine.check_closed()
     states = [x.name for x in inputs if x.name in memory]

@@ -18,7 +18,7 @@ Show = Callable[[str], str]
 Put = Callable[[str, str], str]
 
 
-class Tensor:
+class ScriptTensor:
     """A tensor of the program. ``buffer``: the key of the module's attribute that it is, where it is one."""
 
     def __init__(self, reference: str, buffer: str = "") -> None:
@@ -36,10 +36,10 @@ class Tensor:
         self.version += 1
 
 
-class View(Tensor):
+class TensorView(ScriptTensor):
     """A part of a tensor, or all of it under another shape."""
 
-    def __init__(self, whole: Tensor, show: Show, put: Put | None) -> None:
+    def __init__(self, whole: ScriptTensor, show: Show, put: Put | None) -> None:
         self._whole, self._show, self._put = whole, show, put
         super().__init__(show(whole.read()))
         self.version = whole.version

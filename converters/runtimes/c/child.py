@@ -130,7 +130,7 @@ def _agents_driver(header: Header, code: CodeOptions, branches: Sequence[int]) -
 
 
 class _Library:
-    def __init__(self, path: Path, seed: int, build: _Builder) -> None:
+    def __init__(self, path: Path, seed: int, build: _CompilerProcess) -> None:
         contract = contract_held(path)
         code = CodeOptions.of(contract.tool)
         self.header, self.branches = header_of(contract.name, contract.signature, code), contract.signature.branches
@@ -180,7 +180,7 @@ class _Library:
         return answers_of(header, fetch, made) | {CHOSEN: classes, SIZES: sizes, UNUSUAL: counts}
 
 
-class _Builder:
+class _CompilerProcess:
     """The process that compiles: a source goes in, the path of a library or the compiler's words come out."""
 
     def __init__(self, folder: Path, asked: BinaryIO, answers: BinaryIO) -> None:
@@ -232,7 +232,7 @@ def main() -> None:
         os._exit(0)
     os.close(ask_out)
     os.close(answer_in)
-    build = _Builder(folder, os.fdopen(ask_in, "wb"), os.fdopen(answer_out, "rb"))
+    build = _CompilerProcess(folder, os.fdopen(ask_in, "wb"), os.fdopen(answer_out, "rb"))
     resource.setrlimit(resource.RLIMIT_DATA, (_MEMORY_BYTES, _MEMORY_BYTES))
     confinement.confine(str(folder))
     out = claim_stdout()

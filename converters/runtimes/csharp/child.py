@@ -49,7 +49,7 @@ _RUN_SECONDS = 3600
 _MARK, _MOST_SAID = b"answers:", 1 << 16
 
 
-class CompileError(Exception):
+class McsError(Exception):
     """The compiler's own words."""
 
 
@@ -198,7 +198,7 @@ class _Program:
             _SECONDS + int(size * _SECONDS_PER_BYTE),
         )
         if done.returncode:
-            raise CompileError(f"{REFUSED}:\n{(done.stdout + done.stderr)[:2000]}")
+            raise McsError(f"{REFUSED}:\n{(done.stdout + done.stderr)[:2000]}")
         self.process = subprocess.Popen(  # one thread, so nothing can hold a lock across the fork
             [mono, str(own / "policy.exe"), str(seed), str(own / "weights.bin")],
             stdin=subprocess.PIPE,
@@ -292,7 +292,7 @@ def main() -> None:
         seed = int.from_bytes(os.urandom(8), "little") if seed is None else seed
         return _Program(Path(header["path"]), seed, folder, compiler, mono)
 
-    serve("csharp", "mono", load, (CompileError, ExportModelError), out)
+    serve("csharp", "mono", load, (McsError, ExportModelError), out)
 
 
 if __name__ == "__main__":

@@ -29,10 +29,16 @@ from export_model.converters.files.fetch import Fetched
 from export_model.converters.graph.nn.activations import clip, leaky_relu, swish
 from export_model.converters.policy.facts import SourceFacts
 from export_model.converters.policy.generations import SAC_MEAN, TORCH_VERSION_3
-from export_model.converters.policy.rules import Decision
+from export_model.converters.policy.rules import RoleDecision
 from export_model.converters.trainers.mlagents.body import attend, body_width, goal_width, hidden_layers
 from export_model.converters.trainers.mlagents.bound import Bound, find_bound, trainer_of
-from export_model.converters.trainers.mlagents.sensors import Sensor, dense_name, encoder_of, find_goals, find_sensors
+from export_model.converters.trainers.mlagents.sensors import (
+    SensorInput,
+    dense_name,
+    encoder_of,
+    find_goals,
+    find_sensors,
+)
 from export_model.converters.trainers.mlagents.state import State
 from export_model.converters.trainers.pytorch.activations import LEAKY_SLOPE
 from export_model.converters.trainers.pytorch.network import Network
@@ -153,7 +159,7 @@ def rebuild(state: State, given: Fetched, told: Sequence[tuple[int, ...]], goals
     return Rebuilt(net.graph(), facts, bound.files)
 
 
-def _notes(generation: _Generation, sensors: Sequence[Sensor], joined: bool, bound: Bound) -> list[str]:
+def _notes(generation: _Generation, sensors: Sequence[SensorInput], joined: bool, bound: Bound) -> list[str]:
     notes = [pytorch_alone("ML-Agents", "a checkpoint")]
     if bound.squashed and generation.by_sensor:
         notes.append(SAC_MEAN)
@@ -176,7 +182,7 @@ _JOINED = "vector_observation"
 _SENSOR_ROLES = {1: Role.VECTOR, 2: Role.ENTITIES, 3: Role.VISUAL}
 
 
-def _input_names(generation: _Generation, sensors: Sequence[Sensor]) -> list[str]:
+def _input_names(generation: _Generation, sensors: Sequence[SensorInput]) -> list[str]:
     """What the generation calls the input of each sensor."""
     names, images = list[str](), 0
     for index, sensor in enumerate(sensors):
@@ -187,15 +193,15 @@ def _input_names(generation: _Generation, sensors: Sequence[Sensor]) -> list[str
     return names
 
 
-def _reasons(generation: _Generation, sensors: Sequence[Sensor]) -> dict[str, Decision]:
+def _reasons(generation: _Generation, sensors: Sequence[SensorInput]) -> dict[str, RoleDecision]:
     """Input → why it is an observation, and what of."""
     pairs = [(f"obs_{place}", s) for s in sensors for place in s.places]
     pairs = pairs or list(zip(_input_names(generation, sensors), sensors, strict=True))
-    return {name: Decision(name, _SENSOR_ROLES.get(len(s.shape), Role.VECTOR), s.says) for name, s in pairs}
+    return {name: RoleDecision(name, _SENSOR_ROLES.get(len(s.shape), Role.VECTOR), s.says) for name, s in pairs}
 
 
 def _sensor_inputs(
-    net: Network, generation: _Generation, sensors: Sequence[Sensor], told: Sequence[tuple[int, ...]]
+    net: Network, generation: _Generation, sensors: Sequence[SensorInput], told: Sequence[tuple[int, ...]]
 ) -> list[str]:
     """The numbers of each sensor: an input of its own, a slice of one for all vectors, or inputs joined."""
     if told:
@@ -219,7 +225,7 @@ def _sensor_inputs(
 def _encode_sensors(
     net: Network,
     generation: _Generation,
-    sensors: Sequence[Sensor],
+    sensors: Sequence[SensorInput],
     goals: Sequence[int],
     told: Sequence[tuple[int, ...]],
 ) -> tuple[str, str | None]:

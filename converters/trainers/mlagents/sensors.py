@@ -24,7 +24,7 @@ _MOST_SENSORS = 16
 _SAY = "say what the agent observes, sensor by sensor in the order of their names: --sensors SHAPE,... with shapes like"
 
 
-class Sensor(Struct, frozen=True):
+class SensorInput(Struct, frozen=True):
     """One input of the network.
 
     ``shape`` has lists of entities as [most, numbers], images as C, H, W; ``module`` is None where the numbers go in as
@@ -82,7 +82,7 @@ def dense_name(state: Weights, module: str) -> str:
 # ------------------------------------------------------------------ in which order
 
 
-class Module(Struct, frozen=True):
+class SensorModule(Struct, frozen=True):
     """A module of a checkpoint that encodes a sensor."""
 
     state: Weights
@@ -111,7 +111,7 @@ class Layout(Struct, frozen=True):
 
 #: What a module encodes.
 _IMAGE, _VECTOR, _LIST = "an image", "a normalised vector", "a list of entities"
-_KINDS: tuple[Rule[Module, str], ...] = (
+_KINDS: tuple[Rule[SensorModule, str], ...] = (
     Rule(_IMAGE, lambda m: encoder_of(m.state, m.name) is not None, "its module has the layers of a visual encoder"),
     Rule(
         _VECTOR,
@@ -143,7 +143,7 @@ _LAYOUTS: tuple[Rule[Layout, str], ...] = (
 
 def find_sensors(
     state: Weights, lists: Sequence[str], encoder: str, width: int, told: Sequence[tuple[int, ...]]
-) -> tuple[list[Sensor], bool]:
+) -> tuple[list[SensorInput], bool]:
     """The sensors in the order of the first layer's columns (``width`` of them), and whether vectors stand joined.
 
     ``encoder`` is what holds the attention over lists of entities, whose result is the last columns.
@@ -190,9 +190,9 @@ def _modules(state: Weights, lists: Sequence[str]) -> list[str | None]:
     return modules
 
 
-def _kind(state: Weights, module: str) -> Rule[Module, str]:
+def _kind(state: Weights, module: str) -> Rule[SensorModule, str]:
     """The rule that says what a module encodes. Raises SourceError."""
-    rule = first(_KINDS, Module(state, module))
+    rule = first(_KINDS, SensorModule(state, module))
     if rule is None:
         raise state.unsupported_error(
             f"{module} ({', '.join(state.under(module + '.')[:3])})",
@@ -201,7 +201,7 @@ def _kind(state: Weights, module: str) -> Rule[Module, str]:
     return rule
 
 
-def _arrange(state: Weights, layout: Layout, width: int) -> tuple[list[Sensor], bool]:
+def _arrange(state: Weights, layout: Layout, width: int) -> tuple[list[SensorInput], bool]:
     """The sensors, and whether vectors stand joined. Raises SourceError."""
     rule, rest = first(_LAYOUTS, layout), layout.rest
     if rule is None:
@@ -214,12 +214,12 @@ def _arrange(state: Weights, layout: Layout, width: int) -> tuple[list[Sensor], 
     seen = [_told_by_weights(state, m) for m in layout.known]
     if rule.role == _NONE_LEFT:
         return seen, False
-    vector = Sensor((rest,), None, rule.says)
+    vector = SensorInput((rest,), None, rule.says)
     return ([vector, *seen] if layout.two_lists else [*seen, vector]), True
 
 
 def find_goals(
-    state: Weights, sensors: Sequence[Sensor], width: int, told: Sequence[int], *, joined: bool
+    state: Weights, sensors: Sequence[SensorInput], width: int, told: Sequence[int], *, joined: bool
 ) -> tuple[int, ...]:
     """The places of the sensors that the last hidden layer's weights are made from, ``width`` numbers in all.
 
@@ -285,15 +285,15 @@ def _known_width(state: Weights, module: str | None) -> int:
     return state.length(f"{module}.normalizer.running_mean", 0)
 
 
-def _told_by_weights(state: Weights, module: str) -> Sensor:
+def _told_by_weights(state: Weights, module: str) -> SensorInput:
     """A sensor whose shape follows from its module."""
     encoder, says = encoder_of(state, module), _kind(state, module).says
     if encoder is None:
-        return Sensor(state.shape(f"{module}.normalizer.running_mean"), module, says)
+        return SensorInput(state.shape(f"{module}.normalizer.running_mean"), module, says)
     columns = state.length(f"{dense_name(state, module)}.weight", 1)
     sizes = _sizes(state, module, encoder, columns)
     if len(sizes) == 1:
-        return Sensor(sizes[0], module, says)
+        return SensorInput(sizes[0], module, says)
     squares = [s for s in sizes if s[1] == s[2]]
     example = squares[0] if squares else sizes[0] if sizes else (3, 84, 84)
     shown = ", ".join("x".join(map(str, s)) for s in (squares or sizes)[:8])
@@ -345,7 +345,7 @@ def _from_user(
     lengths: Mapping[str, int],
     width: int,
     told: Sequence[tuple[int, ...]],
-) -> list[Sensor]:
+) -> list[SensorInput]:
     """The sensors that the user names, checked against the weights. Raises UsageError."""
     places: list[tuple[int, ...]] = [(i,) for i in range(len(told))]
     if len(lists) > 1:  # 0.20 to 0.23: all vectors joined before the images
@@ -368,7 +368,7 @@ def _from_user(
             columns += _columns_as_told(state, number, module, shape, told)
     if columns != width:
         raise _contradiction(told, f"its first layer takes {width} columns, and these sensors give {columns}")
-    return [Sensor(tuple(s), module, places=p) for s, module, p in zip(told, given, places, strict=True)]
+    return [SensorInput(tuple(s), module, places=p) for s, module, p in zip(told, given, places, strict=True)]
 
 
 def _columns_as_told(

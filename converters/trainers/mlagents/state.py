@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from export_model.converters.files.unpickle import Tensor
+from export_model.converters.files.unpickle import PickledTensor
 from export_model.converters.trainers.pytorch.weights import TensorFile, Weights
 from export_model.signatures.roles import VERSION_NUMBER
 
@@ -43,4 +43,4 @@ def actor_in(value: Any) -> Mapping[Any, Any] | None:
 def _step_is_float(value: Mapping[str, Any]) -> bool:
     steps = value.get("global_step")
     step = steps.get("_GlobalSteps__global_step") if isinstance(steps, dict) else None
-    return isinstance(step, Tensor) and str(getattr(step.storage, "dtype", "")).startswith("float")
+    return isinstance(step, PickledTensor) and str(getattr(step.storage, "dtype", "")).startswith("float")

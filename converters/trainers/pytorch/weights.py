@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from export_model.converters.files.unpickle import Tensor
+from export_model.converters.files.unpickle import PickledTensor
 from export_model.signatures.errors import DamagedFileError, SourceError
 
 
@@ -17,7 +17,7 @@ class TensorFile(Protocol):
 
     value: Any
 
-    def array(self, tensor: Tensor, name: str) -> np.ndarray:
+    def array(self, tensor: PickledTensor, name: str) -> np.ndarray:
         """Return the numbers of a tensor of the file; ``name`` is for errors. Raises DamagedFileError."""
         ...
 
@@ -26,9 +26,9 @@ class ArraysByName:
     """Arrays that are read already, as a file's tensors."""
 
     def __init__(self, arrays: Mapping[str, np.ndarray]) -> None:
-        self.value: Any = {name: Tensor(a, 0, a.shape, ()) for name, a in arrays.items()}
+        self.value: Any = {name: PickledTensor(a, 0, a.shape, ()) for name, a in arrays.items()}
 
-    def array(self, tensor: Tensor, name: str) -> np.ndarray:
+    def array(self, tensor: PickledTensor, name: str) -> np.ndarray:
         """Return a tensor's numbers."""
         found: np.ndarray = tensor.storage
         return found
@@ -43,8 +43,8 @@ class Weights:
 
     def __init__(self, archive: TensorFile, tensors: Mapping[Any, Any], *, holder: str, maker: str, fix: str) -> None:
         self._archive, self._holder, self._maker, self._fix = archive, holder, maker, fix
-        self._tensors: Mapping[str, Tensor] = {
-            k: v for k, v in tensors.items() if isinstance(k, str) and isinstance(v, Tensor)
+        self._tensors: Mapping[str, PickledTensor] = {
+            k: v for k, v in tensors.items() if isinstance(k, str) and isinstance(v, PickledTensor)
         }
         self._left = {str(name) for name in tensors}
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from msgspec import Struct
 
-from export_model.converters.files.unpickle import Tensor
+from export_model.converters.files.unpickle import PickledTensor
 from export_model.converters.trainers.scripts import cleanrl, ppo_pytorch
 from export_model.converters.trainers.scripts.building import Making
 
@@ -75,7 +75,7 @@ def _begins(state: Mapping[Any, Any], start: str) -> bool:
 def shape_of(state: Mapping[Any, Any], name: str) -> tuple[int, ...]:
     """Return the shape of a tensor; () where there is none of that name."""
     tensor = state.get(name)
-    return tensor.shape if isinstance(tensor, Tensor) else ()
+    return tensor.shape if isinstance(tensor, PickledTensor) else ()
 
 
 def width_of(state: Mapping[Any, Any], module: str) -> int:

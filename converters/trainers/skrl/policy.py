@@ -40,7 +40,7 @@ _CLASSES = ("GaussianMixin", "DeterministicMixin", "CategoricalMixin")
 _EPSILON, _LIMIT = 1e-8, 5.0
 
 
-class _Making(Struct):
+class _SkrlPolicy(Struct):
     net: Network
     model: Settings
     observation: str
@@ -69,7 +69,7 @@ def rebuild_policy(saved: Saved, state: Mapping[Any, Any], settings: Settings) -
     weights = Weights(saved.archive, both, holder="its policy", maker="skrl", fix=EXPORT_ONNX)
     weights.forget("value_layer.")
     net = Network(weights)
-    made = _Making(net, model, "")
+    made = _SkrlPolicy(net, model, "")
     made.observation = _observe(made, saved, normalised=bool(statistics))
     shared = not models.flag("separate", default=True)
     x = _containers(made, shared=shared)
@@ -109,7 +109,7 @@ def _statistics(saved: Saved, settings: Settings) -> Mapping[Any, Any]:
     return found
 
 
-def _observe(made: _Making, saved: Saved, *, normalised: bool) -> str:
+def _observe(made: _SkrlPolicy, saved: Saved, *, normalised: bool) -> str:
     """Return the observation as training saw it; an image is [B, H, W, C] where the settings permute it."""
     net, weights = made.net, made.net.state
     first = f"{_container_names(made.model)[0]}_container.0.weight"
@@ -157,7 +157,7 @@ def _container_names(model: Settings) -> list[str]:
     return names
 
 
-def _containers(made: _Making, *, shared: bool) -> str:
+def _containers(made: _SkrlPolicy, *, shared: bool) -> str:
     """Return the last container's result; each one's is known by its name."""
     containers = made.model.sections("network")
     x = ""
@@ -172,7 +172,7 @@ def _containers(made: _Making, *, shared: bool) -> str:
     return x
 
 
-def _layers(made: _Making, x: str, container: Settings, module: str, *, embedded: bool) -> str:
+def _layers(made: _SkrlPolicy, x: str, container: Settings, module: str, *, embedded: bool) -> str:
     """Return the result of ``nn.Sequential``; ``embedded``: the output's layer is its last."""
     net, place = made.net, 0
     for layer, activation in zip(*_plan(container), strict=True):
@@ -261,7 +261,7 @@ def _has_layer(model: Settings) -> bool:
     return any(token in model.text("output") for token in _SIZED)
 
 
-def _output(made: _Making, x: str, *, shared: bool) -> str:
+def _output(made: _SkrlPolicy, x: str, *, shared: bool) -> str:
     """Return the result of the model's output expression."""
     net, text = made.net, made.model.text("output")
     if shared:
@@ -273,7 +273,7 @@ def _output(made: _Making, x: str, *, shared: bool) -> str:
     )
 
 
-def _gaussian(made: _Making, mean: str) -> None:
+def _gaussian(made: _SkrlPolicy, mean: str) -> None:
     net, model = made.net, made.model
     if model.flag("clip_mean_actions"):
         raise model.error("clip_mean_actions", "is true: the limits are the environment's, which are not in the file")
@@ -288,14 +288,14 @@ def _gaussian(made: _Making, mean: str) -> None:
     )
 
 
-def _deterministic(made: _Making, action: str) -> None:
+def _deterministic(made: _SkrlPolicy, action: str) -> None:
     if made.model.flag("clip_actions"):
         raise made.model.error("clip_actions", "is true: the limits are the environment's, which are not in the file")
     made.net.output("action", action)
     made.outputs["action"] = Role.ACTION
 
 
-def _categorical(made: _Making, values: str) -> None:
+def _categorical(made: _SkrlPolicy, values: str) -> None:
     net = made.net
     logits = values if made.model.flag("unnormalized_log_prob", default=True) else net.add("Log", [values])
     net.at("action")

@@ -65,7 +65,7 @@ def agents(trial: Trial, participant: Participant) -> Iterator[Finding]:
         yield from check()
 
 
-class _Step(Struct, frozen=True):
+class _DrivenStep(Struct, frozen=True):
     """What agents were fed, noise and state included; what they answered; what the reference does."""
 
     case: Case
@@ -89,7 +89,7 @@ class _Played:
         alike = {n: np.repeat(a[:1], AGENTS, axis=0) if len(a) == AGENTS else a for n, a in self.observed[0].items()}
         self.begun = self._step("an episode begins", alike, {}, seed=True, repeat=STARTS, choose=STARTS)
         self.repeat = self._repeat()
-        self.steps, state = list[_Step](), dict[str, np.ndarray]()
+        self.steps, state = list[_DrivenStep](), dict[str, np.ndarray]()
         for number, feeds in enumerate(self.observed):
             where = f"act, step {number + 1} of {len(self.observed)}"
             self.steps.append(self._step(where, feeds, state, seed=not number, repeat=self.repeat, choose=DRAWS))
@@ -110,7 +110,7 @@ class _Played:
         """What the program calls an input or output of the policy."""
         return self.participant.called.get(name, name)
 
-    def _answer(self, step: _Step, name: str) -> np.ndarray:
+    def _answer(self, step: _DrivenStep, name: str) -> np.ndarray:
         """An output, or noise, in the shape that the policy has it in."""
         signature = self.trial.signature
         spec = signature.input(name) if signature.has_input(name) else signature.output(name)
@@ -127,7 +127,7 @@ class _Played:
             return wanted
         return max(1, allowance.left // steps)
 
-    def _step(self, where: str, feeds: Feeds, state: Feeds, *, seed: bool, repeat: int, choose: int) -> _Step:
+    def _step(self, where: str, feeds: Feeds, state: Feeds, *, seed: bool, repeat: int, choose: int) -> _DrivenStep:
         """A decision of each agent, several times from the same state."""
         header, outer = self.header, self.trial.signature
         names = [f.spec.name for f in fields_of_agent(header)]
@@ -146,7 +146,7 @@ class _Played:
                 "sized": [f.spec.name for f in fields_with_size(header)],
             },
         )
-        step = _Step(Case(where, {}, AGENTS), answer, {})
+        step = _DrivenStep(Case(where, {}, AGENTS), answer, {})
         noise = [s for s in outer.noise if self._own(s.name) in answer]
         drawn = {s.name: self._answer(step, s.name).astype(s.dtype) for s in noise}
         return replace(step, case=Case(where, {**feeds, **state, **drawn}, AGENTS))
@@ -172,7 +172,7 @@ class _Played:
                 yield self._finding(Acting, "*", said, step.case.name)
                 return
 
-    def _unusual(self, step: _Step, most: float) -> list[int]:
+    def _unusual(self, step: _DrivenStep, most: float) -> list[int]:
         counts = np.zeros(AGENTS, int)
         ours = {self._own(n): a for n, a in step.case.feeds.items()}
         for f in self.header.inputs:

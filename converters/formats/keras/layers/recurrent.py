@@ -10,7 +10,7 @@ from msgspec import Struct
 
 from export_model.converters.formats.keras.layers.activations import activation_of
 from export_model.converters.formats.keras.layers.step import Step, Translate
-from export_model.converters.formats.keras.model import Layer, cells_of, layer_of
+from export_model.converters.formats.keras.model import KerasLayer, cells_of, layer_of
 from export_model.converters.graph.nn import recurrent as nn
 from export_model.converters.graph.nn.activations import Activation
 from export_model.converters.graph.types import FLOAT32
@@ -183,7 +183,7 @@ def _bidirectional(step: Step) -> list[str]:
     if not step.get("backward_layer"):
         turned["go_backwards"] = not forward.config.get("go_backwards")
     results = []
-    for layer in (forward, Layer(backward.kind, backward.name, turned)):
+    for layer in (forward, KerasLayer(backward.kind, backward.name, turned)):
         inside = step.inner(layer, [step.x], step.left)
         (value,) = LAYERS[layer.kind](inside)
         step.left = inside.left

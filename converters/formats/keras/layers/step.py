@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from export_model.converters.formats.keras.model import Layer
+from export_model.converters.formats.keras.model import KerasLayer
 from export_model.converters.graph.types import FLOAT32
 from export_model.signatures.errors import DamagedFileError, UnsupportedOpError
 
 if TYPE_CHECKING:
-    from export_model.converters.formats.keras.network import Network
+    from export_model.converters.formats.keras.network import KerasNetwork
 
 Translate = Callable[["Step"], "str | Sequence[str]"]
 
@@ -22,8 +22,8 @@ class Step:
 
     def __init__(
         self,
-        net: Network,
-        layer: Layer,
+        net: KerasNetwork,
+        layer: KerasLayer,
         arrays: Sequence[np.ndarray],
         args: Sequence[Any] = (),
         kwargs: Mapping[str, Any] | None = None,
@@ -34,7 +34,7 @@ class Step:
         #: settings and named arguments that were asked for
         self.asked: set[str] = set()
 
-    def inner(self, layer: Layer, args: Sequence[Any], arrays: Sequence[np.ndarray]) -> Step:
+    def inner(self, layer: KerasLayer, args: Sequence[Any], arrays: Sequence[np.ndarray]) -> Step:
         """A call of a layer that this one wraps."""
         return Step(self.net, layer, arrays, args, {}, f"{self.path}/{layer.name}")
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from export_model.converters.formats.litert.importer.elementwise import add_activation
-from export_model.converters.formats.litert.importer.importer import Importer
-from export_model.converters.formats.litert.importer.operator import Op, Translate
+from export_model.converters.formats.litert.importer.importer import LiteRTImporter
+from export_model.converters.formats.litert.importer.operator import LiteRTOp, Translate
 from export_model.converters.graph.nn import choosing as nn
 from export_model.converters.graph.nodes import ref
 from export_model.converters.graph.types import INT32
@@ -21,7 +21,7 @@ _REDUCTIONS = {
 }
 
 
-def _reshape(op: Op, net: Importer) -> str:
+def _reshape(op: LiteRTOp, net: LiteRTImporter) -> str:
     """The shape is an operand, or (in files from before there was one) an option, in which [0] is a scalar's."""
     target = op.get(1)
     if target is None:
@@ -35,18 +35,18 @@ def _reshape(op: Op, net: Importer) -> str:
     return net.add("Reshape", [op.need(0), target])
 
 
-def _squeeze(op: Op, net: Importer) -> str:
+def _squeeze(op: LiteRTOp, net: LiteRTImporter) -> str:
     return net.add("Squeeze", [op.need(0)], squeeze_dims=tuple(op.integers("squeeze_dims")))
 
 
-def _axis(op: Op, net: Importer, position: int) -> int:
+def _axis(op: LiteRTOp, net: LiteRTImporter, position: int) -> int:
     value = net.needed_constant(op.need(position), "its axis").reshape(-1)
     if value.size != 1:
         raise op.refusal(f"it has {value.size} axes in place of one")
     return int(value[0])
 
 
-def _reverse(op: Op, net: Importer) -> str:
+def _reverse(op: LiteRTOp, net: LiteRTImporter) -> str:
     x = op.need(0)
     axes = {net.axis(x, int(a)) for a in net.needed_constant(op.need(1), "its axes").reshape(-1)}
     for axis in sorted(axes):
@@ -54,17 +54,17 @@ def _reverse(op: Op, net: Importer) -> str:
     return x
 
 
-def _expand_dims(op: Op, net: Importer) -> str:
+def _expand_dims(op: LiteRTOp, net: LiteRTImporter) -> str:
     return net.add("ExpandDims", [op.need(0), net.ints(_axis(op, net, 1), "axis")])
 
 
-def _concat(op: Op, net: Importer) -> str:
+def _concat(op: LiteRTOp, net: LiteRTImporter) -> str:
     parts, axis = op.operands(), op.integer("axis")
     value = net.add("ConcatV2", [*parts, net.ints(axis, "axis")]) if len(parts) > 1 else parts[0]
     return add_activation(op, net, value)
 
 
-def _pack(op: Op, net: Importer) -> str:
+def _pack(op: LiteRTOp, net: LiteRTImporter) -> str:
     return net.add("Pack", op.operands(), axis=op.integer("axis"))
 
 
@@ -72,26 +72,26 @@ def _several(node: str, count: int) -> list[str]:
     return [ref(node, i) for i in range(count)]
 
 
-def _unpack(op: Op, net: Importer) -> list[str]:
+def _unpack(op: LiteRTOp, net: LiteRTImporter) -> list[str]:
     count = len(op.dtypes)
     return _several(net.add("Unpack", [op.need(0)], num=count, axis=op.integer("axis")), count)
 
 
-def _split(op: Op, net: Importer) -> list[str]:
+def _split(op: LiteRTOp, net: LiteRTImporter) -> list[str]:
     count = len(op.dtypes)
     return _several(net.add("Split", [op.need(0), op.need(1)], num_split=count), count)
 
 
-def _split_v(op: Op, net: Importer) -> list[str]:
+def _split_v(op: LiteRTOp, net: LiteRTImporter) -> list[str]:
     count = len(op.dtypes)
     return _several(net.add("SplitV", op.operands(), num_split=count), count)
 
 
-def _slice(op: Op, net: Importer) -> str:
+def _slice(op: LiteRTOp, net: LiteRTImporter) -> str:
     return net.add("Slice", op.operands())
 
 
-def _strided_slice(op: Op, net: Importer) -> str:
+def _strided_slice(op: LiteRTOp, net: LiteRTImporter) -> str:
     """With ``offset`` an end is counted from its beginning."""
     x, begin, end, strides = op.operands()
     if op.flag("offset"):
@@ -103,13 +103,13 @@ def _strided_slice(op: Op, net: Importer) -> str:
     return net.add("StridedSlice", [x, begin, end, strides], **masks)
 
 
-def _gather(op: Op, net: Importer) -> str:
+def _gather(op: LiteRTOp, net: LiteRTImporter) -> str:
     if op.integer("batch_dims"):
         raise op.refusal("it looks up rows of each row (batch_dims)")
     return net.add("GatherV2", [op.need(0), op.need(1), net.ints(op.integer("axis"), "axis")])
 
 
-def _gather_nd(op: Op, net: Importer) -> str:
+def _gather_nd(op: LiteRTOp, net: LiteRTImporter) -> str:
     """Of one index each, as rows are looked up."""
     x, indices = op.need(0), op.need(1)
     if net.length(indices, -1) != 1:
@@ -117,27 +117,27 @@ def _gather_nd(op: Op, net: Importer) -> str:
     return net.add("GatherV2", [x, net.squeeze(indices, [net.rank(indices) - 1]), net.ints(0, "axis")])
 
 
-def _transpose(op: Op, net: Importer) -> str:
+def _transpose(op: LiteRTOp, net: LiteRTImporter) -> str:
     return net.add("Transpose", op.operands())
 
 
-def _tile(op: Op, net: Importer) -> str:
+def _tile(op: LiteRTOp, net: LiteRTImporter) -> str:
     return net.add("Tile", op.operands())
 
 
-def _broadcast(op: Op, net: Importer) -> str:
+def _broadcast(op: LiteRTOp, net: LiteRTImporter) -> str:
     return net.add("BroadcastTo", op.operands())
 
 
-def _shape(op: Op, net: Importer) -> str:
+def _shape(op: LiteRTOp, net: LiteRTImporter) -> str:
     return net.add("Shape", [op.need(0)], out_type=op.dtypes[0])
 
 
-def _rank(op: Op, net: Importer) -> str:
+def _rank(op: LiteRTOp, net: LiteRTImporter) -> str:
     return net.const(np.array(net.rank(op.need(0)), INT32), "rank")
 
 
-def _range(op: Op, net: Importer) -> str:
+def _range(op: LiteRTOp, net: LiteRTImporter) -> str:
     return net.add("Range", op.operands())
 
 
@@ -149,25 +149,25 @@ def _arg(kind: str) -> Translate:
     return lambda op, net: net.add(kind, [op.need(0), net.ints(_axis(op, net, 1), "axis")], output_type=op.dtypes[0])
 
 
-def _one_hot(op: Op, net: Importer) -> str:
+def _one_hot(op: LiteRTOp, net: LiteRTImporter) -> str:
     return net.add("OneHot", op.operands(), axis=op.integer("axis"))
 
 
-def _where(op: Op, net: Importer) -> str:
+def _where(op: LiteRTOp, net: LiteRTImporter) -> str:
     return net.add("Where", [op.need(0)])
 
 
-def _sparse_to_dense(op: Op, net: Importer) -> str:
+def _sparse_to_dense(op: LiteRTOp, net: LiteRTImporter) -> str:
     return net.add("SparseToDense", op.operands(), validate_indices=False)
 
 
-def _top_k(op: Op, net: Importer) -> list[str]:
+def _top_k(op: LiteRTOp, net: LiteRTImporter) -> list[str]:
     count = net.needed_constant(op.need(1), "the number of elements").reshape(-1)
     best, place = nn.top_k(net, op.need(0), int(count[0]))
     return [best, net.cast(place, op.dtypes[1])]
 
 
-def _cumulative_sum(op: Op, net: Importer) -> str:
+def _cumulative_sum(op: LiteRTOp, net: LiteRTImporter) -> str:
     axis = net.axis(op.need(0), _axis(op, net, 1))
     x = nn.last(net, op.need(0), axis)
     return nn.moved_back(net, nn.cumulate(net, x, exclusive=op.flag("exclusive"), reverse=op.flag("reverse")), axis)
@@ -177,7 +177,7 @@ def _sampler(kind: str) -> Translate:
     return lambda op, net: net.add(kind, [op.need(0)], dtype=op.dtypes[0])
 
 
-def _multinomial(op: Op, net: Importer) -> str:
+def _multinomial(op: LiteRTOp, net: LiteRTImporter) -> str:
     return net.add("Multinomial", op.operands(), output_dtype=op.dtypes[0])
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from export_model.converters.formats.litert.importer.importer import Importer
-from export_model.converters.formats.litert.importer.operator import Op, Translate
+from export_model.converters.formats.litert.importer.importer import LiteRTImporter
+from export_model.converters.formats.litert.importer.operator import LiteRTOp, Translate
 from export_model.converters.formats.litert.schema import ACTIVATIONS
 from export_model.converters.graph.builder import Builder
 from export_model.converters.graph.nn import activations as nn
@@ -41,7 +41,7 @@ _APPLIED: Mapping[str, Callable[[Builder, str], str]] = {
 }
 
 
-def add_activation(op: Op, net: Importer, value: str) -> str:
+def add_activation(op: LiteRTOp, net: LiteRTImporter, value: str) -> str:
     """A result with the activation that the operator is told to apply. Raises UnsupportedOpError."""
     number = op.integer("activation")
     if not number:
@@ -63,41 +63,41 @@ def _plain(function: Callable[[Builder, str], str]) -> Translate:
     return lambda op, net: function(net, op.need(0))
 
 
-def _cast(op: Op, net: Importer) -> str:
+def _cast(op: LiteRTOp, net: LiteRTImporter) -> str:
     return net.add("Cast", [op.need(0)], DstT=op.dtypes[0])
 
 
-def _softmax(op: Op, net: Importer) -> str:
+def _softmax(op: LiteRTOp, net: LiteRTImporter) -> str:
     """Over the last axis; ``beta`` is a factor in front, 1 in every model that TensorFlow's converter makes."""
     return net.add("Softmax", [nn.scale_and_shift(net, op.need(0), op.number("beta"))])
 
 
-def _leaky_relu(op: Op, net: Importer) -> str:
+def _leaky_relu(op: LiteRTOp, net: LiteRTImporter) -> str:
     return nn.leaky_relu(net, op.need(0), op.number("alpha"))
 
 
-def _prelu(op: Op, net: Importer) -> str:
+def _prelu(op: LiteRTOp, net: LiteRTImporter) -> str:
     return nn.prelu(net, op.need(0), op.need(1))
 
 
-def _gelu(op: Op, net: Importer) -> str:
+def _gelu(op: LiteRTOp, net: LiteRTImporter) -> str:
     return nn.gelu(net, op.need(0), tanh=op.flag("approximate"))
 
 
-def _unit_length(op: Op, net: Importer) -> str:
+def _unit_length(op: LiteRTOp, net: LiteRTImporter) -> str:
     return add_activation(op, net, unit_length(net, op.need(0), net.rank(op.need(0)) - 1))
 
 
-def _select(op: Op, net: Importer) -> str:
+def _select(op: LiteRTOp, net: LiteRTImporter) -> str:
     """SELECT takes operands of one shape, and rows by a vector."""
     return net.add("Select", op.operands())
 
 
-def _select_v2(op: Op, net: Importer) -> str:
+def _select_v2(op: LiteRTOp, net: LiteRTImporter) -> str:
     return net.where(*op.operands())
 
 
-def _full(op: Op, net: Importer) -> str:
+def _full(op: LiteRTOp, net: LiteRTImporter) -> str:
     return net.add("Fill", [net.shape_operand(op.need(0)), op.need(1)])
 
 

@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping
 import numpy as np
 
 from export_model.converters.formats.litert.flatbuffer import Table
-from export_model.converters.formats.litert.importer.operator import Op, Translate
+from export_model.converters.formats.litert.importer.operator import LiteRTOp, Translate
 from export_model.converters.formats.litert.tensors import UNNAMED, Tensors, damaged_error
 from export_model.converters.formats.onnx.importer.importer import node_name
 from export_model.converters.graph.builder import Builder
@@ -20,7 +20,7 @@ from export_model.signatures.errors import UnsupportedOpError
 KERNELS = {"FULLY_CONNECTED": (1, 0), "CONV_2D": (1, 2, 3, 0)}
 
 
-class Importer(Builder):
+class LiteRTImporter(Builder):
     """The builder of a subgraph's graph.
 
     ``ports`` are the tensors that are fed, by their numbers, with the names that a caller uses. ``stored`` are the
@@ -108,7 +108,7 @@ class Importer(Builder):
         dtypes = tuple(self.tensors.dtype(i) for i in outputs)
         axes = KERNELS.get(kind)
         read = [self._kernel(n, axes) if axes and i == 1 else self.operand(n) for i, n in enumerate(inputs)]
-        op = Op(kind, name, tuple(read), operator.get("builtin_options", {}), dtypes)
+        op = LiteRTOp(kind, name, tuple(read), operator.get("builtin_options", {}), dtypes)
         node = self.node_named(outputs[0])
         self.prefix, started = node, len(self.nodes)
         try:
@@ -144,7 +144,7 @@ class Importer(Builder):
         """Weights that are kept in fewer bytes, as the floats that they stand for."""
         value = self.tensors.widened(inputs[0]) if len(inputs) == len(outputs) == 1 else None
         if value is None:
-            raise Op(kind, name, (), {}, ()).refusal(
+            raise LiteRTOp(kind, name, (), {}, ()).refusal(
                 "it turns integers that the model computes with into floats", _INTEGERS, _FLOATS
             )
         self.widened = True
@@ -168,7 +168,7 @@ _REASONS: tuple[tuple[tuple[str, ...], str, str], ...] = (
 
 
 def _unknown_operator_error(kind: str, name: str) -> UnsupportedOpError:
-    op = Op(kind, name, (), {}, ())
+    op = LiteRTOp(kind, name, (), {}, ())
     for beginnings, why, fix in _REASONS:
         if kind.startswith(beginnings):
             return op.refusal("it is not read", why, fix)

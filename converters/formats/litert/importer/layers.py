@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from export_model.converters.formats.litert.importer.elementwise import add_activation
-from export_model.converters.formats.litert.importer.importer import KERNELS, Importer
-from export_model.converters.formats.litert.importer.operator import Op, Translate
+from export_model.converters.formats.litert.importer.importer import KERNELS, LiteRTImporter
+from export_model.converters.formats.litert.importer.operator import LiteRTOp, Translate
 from export_model.converters.formats.litert.schema import PADDINGS
 from export_model.converters.graph.nn.convolution import Window, conv2d, conv2d_transposed, transposed_window
 from export_model.converters.graph.nn.dilation import (
@@ -25,7 +25,7 @@ from export_model.converters.graph.ops.transposed import result_lengths
 _PADDING = {number: name for name, number in PADDINGS.items()}
 
 
-def _fully_connected(op: Op, net: Importer) -> str:
+def _fully_connected(op: LiteRTOp, net: LiteRTImporter) -> str:
     """Rows of the last axis (or of as many numbers as a result has weights), times a matrix with a row per result."""
     x, weights = op.need(0), op.need(1)
     if op.integer("weights_format"):
@@ -41,7 +41,7 @@ def _fully_connected(op: Op, net: Importer) -> str:
     return value
 
 
-def _with_bias(op: Op, net: Importer, value: str) -> str:
+def _with_bias(op: LiteRTOp, net: LiteRTImporter, value: str) -> str:
     """The bias, unless it is one of zeros without a name, which a layer without one is given; then the activation."""
     bias = op.get(2)
     if bias is not None:
@@ -51,7 +51,7 @@ def _with_bias(op: Op, net: Importer, value: str) -> str:
     return add_activation(op, net, value)
 
 
-def _batch_matmul(op: Op, net: Importer) -> str:
+def _batch_matmul(op: LiteRTOp, net: LiteRTImporter) -> str:
     a, b = op.need(0), op.need(1)
     x_turned, y_turned = op.flag("adj_x"), op.flag("adj_y")
     if net.rank(a) == net.rank(b) == 2:
@@ -59,19 +59,19 @@ def _batch_matmul(op: Op, net: Importer) -> str:
     return net.add("BatchMatMul", [a, b], adj_x=x_turned, adj_y=y_turned)
 
 
-def _windows(op: Op, **more: Any) -> dict[str, Any]:
+def _windows(op: LiteRTOp, **more: Any) -> dict[str, Any]:
     padding = _PADDING.get(op.integer("padding"))
     if padding is None:
         raise op.refusal(f"its padding is {op.integer('padding')}, which is neither SAME nor VALID")
     return {"padding": padding, "strides": (1, op.integer("stride_h"), op.integer("stride_w"), 1), **more}
 
 
-def _dilated_windows(op: Op) -> dict[str, Any]:
+def _dilated_windows(op: LiteRTOp) -> dict[str, Any]:
     down, across = (op.integer(f"dilation_{side}_factor", 1) for side in ("h", "w"))
     return _windows(op, dilations=(1, down, across, 1))
 
 
-def _conv2d(op: Op, net: Importer) -> str:
+def _conv2d(op: LiteRTOp, net: LiteRTImporter) -> str:
     image, kernel = op.need(0), op.need(1)
     if kernel not in net.kernels:
         kernel = net.transpose(kernel, KERNELS[op.kind])
@@ -86,7 +86,7 @@ def _conv2d(op: Op, net: Importer) -> str:
     return _with_bias(op, net, conv2d(net, image, kernel, window, channels // taken))
 
 
-def _depthwise(op: Op, net: Importer) -> str:
+def _depthwise(op: LiteRTOp, net: LiteRTImporter) -> str:
     """A filter is [1, height, width, channels · multiplier] here."""
     image, kernel = op.need(0), net.needed_constant(op.need(1), "its kernel")
     _, height, width, results = kernel.shape
@@ -97,7 +97,7 @@ def _depthwise(op: Op, net: Importer) -> str:
     return _with_bias(op, net, net.add("DepthwiseConv2dNative", [image, own], **_dilated_windows(op)))
 
 
-def _conv_transpose(op: Op, net: Importer) -> str:
+def _conv_transpose(op: LiteRTOp, net: LiteRTImporter) -> str:
     """By filters [out, height, width, in]; the first operand is the size of the result."""
     weights, image = net.needed_constant(op.need(1), "its kernel").transpose(1, 2, 3, 0), op.need(2)
     result = result_lengths(net.producer, net.constant, op.need(0))
@@ -109,18 +109,18 @@ def _conv_transpose(op: Op, net: Importer) -> str:
     return add_activation(op, net, value if bias is None else net.add("BiasAdd", [value, bias]))
 
 
-def _blocks(op: Op, net: Importer) -> Blocks:
+def _blocks(op: LiteRTOp, net: LiteRTImporter) -> Blocks:
     return blocks_of(*(net.needed_constant(op.need(i), "its block") for i in (1, 2)))
 
 
-def _space_to_batch(op: Op, net: Importer) -> str:
+def _space_to_batch(op: LiteRTOp, net: LiteRTImporter) -> str:
     blocks = _blocks(op, net)
     made = space_to_batch(net, op.need(0), blocks)
     net.blocks[net.position[made]] = op.need(0), blocks
     return made
 
 
-def _batch_to_space(op: Op, net: Importer) -> str:
+def _batch_to_space(op: LiteRTOp, net: LiteRTImporter) -> str:
     """The dilated convolution that the blocks were made for; without one they are put together."""
     crops = _blocks(op, net)
     found = find_convolution(net.producer, op.need(0))
@@ -132,14 +132,14 @@ def _batch_to_space(op: Op, net: Importer) -> str:
 
 
 def _pool(kind: str) -> Translate:
-    def translate(op: Op, net: Importer) -> str:
+    def translate(op: LiteRTOp, net: LiteRTImporter) -> str:
         size = (1, op.integer("filter_height"), op.integer("filter_width"), 1)
         return add_activation(op, net, net.add(kind, [op.need(0)], **_windows(op, ksize=size)))
 
     return translate
 
 
-def _pad(op: Op, net: Importer) -> str:
+def _pad(op: LiteRTOp, net: LiteRTImporter) -> str:
     operands = op.operands()
     paddings = net.needed_constant(operands[1], "the paddings").astype(np.int64)
     if (paddings < 0).any():

@@ -11,10 +11,10 @@ from msgspec import Struct
 from export_model.signatures.errors import UnsupportedOpError
 
 if TYPE_CHECKING:
-    from export_model.converters.formats.litert.importer.importer import Importer
+    from export_model.converters.formats.litert.importer.importer import LiteRTImporter
 
 
-class Op(Struct, frozen=True):
+class LiteRTOp(Struct, frozen=True):
     """One operator. ``inputs`` are references into the new graph, None for an operand that is left out.
 
     ``name`` is its first result's, ``options`` the fields that the file says, ``dtypes`` those of its results.
@@ -68,4 +68,4 @@ class Op(Struct, frozen=True):
 
 
 #: Makes the operator's results in the new graph: the reference of the only one, or one per result.
-Translate = Callable[[Op, "Importer"], "str | Sequence[str]"]
+Translate = Callable[[LiteRTOp, "LiteRTImporter"], "str | Sequence[str]"]

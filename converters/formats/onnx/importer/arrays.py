@@ -12,7 +12,7 @@ from export_model.converters.formats.onnx.importer.node import Op, Translate
 from export_model.converters.graph.types import FLOAT32, INT64, Dim, product
 
 #: Constants that a few bytes of the model make may not be larger.
-MAX_ELEMENTS = 1 << 22
+MAX_RANGE_ELEMENTS = 1 << 22
 
 
 # ------------------------------------------------------------------ constants
@@ -52,7 +52,7 @@ def _range(op: Op, net: Importer) -> str:
     values = [net.constant_of(o) for o in operands]
     if all(v is not None and v.size == 1 for v in values):
         start, limit, delta = (float(v.reshape(())) for v in values if v is not None)
-        if delta == 0 or (limit - start) / delta > MAX_ELEMENTS:
+        if delta == 0 or (limit - start) / delta > MAX_RANGE_ELEMENTS:
             raise op.op_error(f"it counts from {start:g} to {limit:g} by {delta:g}", "the model is damaged")
     return net.add("Range", operands)
 

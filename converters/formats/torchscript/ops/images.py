@@ -8,7 +8,7 @@ from typing import Any, Literal, cast
 import numpy as np
 
 from export_model.converters.formats.torchscript.machine import Machine
-from export_model.converters.formats.torchscript.values import Tensor
+from export_model.converters.formats.torchscript.values import ScriptTensor
 from export_model.converters.graph.nn.resizing import Resampling, resample
 from export_model.signatures.errors import UnsupportedOpError
 
@@ -37,15 +37,15 @@ def _adaptive_pool(kind: str, axes: int) -> Callable[..., Any]:
             parts = [m.b.reduce(kind, m.b.slice(value, axis, *share), [axis], keep=True) for share in shares]
             value = m.b.concat(parts, axis)
         # what a pool of the largest gives beside, the indices, is never used by a policy
-        return Tensor(value) if kind == "Mean" else (Tensor(value), None)
+        return ScriptTensor(value) if kind == "Mean" else (ScriptTensor(value), None)
 
     return translate
 
 
-def _upsample(axes: int, mode: str) -> Callable[..., Tensor]:
+def _upsample(axes: int, mode: str) -> Callable[..., ScriptTensor]:
     """``output_size`` or factors (one for all, or one for each axis), and ``align_corners`` where it is weighted."""
 
-    def translate(m: Machine, x: Any, output_size: Any, *rest: Any) -> Tensor:
+    def translate(m: Machine, x: Any, output_size: Any, *rest: Any) -> ScriptTensor:
         value, given = m.ref(x), list(rest)
         corners = bool(given.pop(0)) if mode != "nearest" else False
         numbers = [n for item in given for n in (item if isinstance(item, list | tuple) else [item])]
@@ -60,19 +60,19 @@ def _upsample(axes: int, mode: str) -> Callable[..., Tensor]:
             before, scale = m.b.length(value, axis), scales[number]
             length = int(output_size[number]) if output_size else int(before * (scale or 1))
             value = resample(m.b, value, axis, length, scale or length / before, how)
-        return Tensor(value)
+        return ScriptTensor(value)
 
     return translate
 
 
-def _pad(m: Machine, x: Any, pad: Sequence[int], mode: Any = "constant", value: Any = None) -> Tensor:
+def _pad(m: Machine, x: Any, pad: Sequence[int], mode: Any = "constant", value: Any = None) -> ScriptTensor:
     """``pad`` begins with the last axis, and has what goes before and behind it."""
     made, pads = m.ref(x), [int(n) for n in pad]
     pairs = [(0, 0)] * m.b.rank(made)
     for number in range(len(pads) // 2):
         pairs[-1 - number] = (pads[2 * number], pads[2 * number + 1])
     if mode == "constant":
-        return Tensor(m.b.pad(made, pairs, None if value is None else float(value)))
+        return ScriptTensor(m.b.pad(made, pairs, None if value is None else float(value)))
     kind = {"reflect": "reflect", "replicate": "edge", "circular": "wrap"}.get(str(mode))
     if kind is None:
         raise UnsupportedOpError(f"a border that is called {str(mode)[:20]!r}", why="four kinds are known")
@@ -82,14 +82,14 @@ def _pad(m: Machine, x: Any, pad: Sequence[int], mode: Any = "constant", value: 
             m.b.room(before + length + after)
             of_numpy = cast(Literal["reflect", "edge", "wrap"], kind)
             made = m.b.take(made, np.pad(np.arange(length), (before, after), mode=of_numpy).tolist(), axis)
-    return Tensor(made)
+    return ScriptTensor(made)
 
 
-def _pad_by_mode(mode: str) -> Callable[..., Tensor]:
+def _pad_by_mode(mode: str) -> Callable[..., ScriptTensor]:
     return lambda m, x, padding: _pad(m, x, padding, mode)
 
 
-def _pixel_shuffle(m: Machine, x: Any, factor: Any) -> Tensor:
+def _pixel_shuffle(m: Machine, x: Any, factor: Any) -> ScriptTensor:
     """[B, C·r², H, W] as [B, C, H·r, W·r]."""
     value, r = m.ref(x), int(factor)
     rows, (channels, height, width) = m.b.shape(value)[0], (m.b.length(value, i) for i in (1, 2, 3))
@@ -97,7 +97,7 @@ def _pixel_shuffle(m: Machine, x: Any, factor: Any) -> Tensor:
         raise UnsupportedOpError(f"{channels} channels are laid out by {r}", why="its code is damaged")
     wide = m.b.reshape(value, (rows, channels // (r * r), r, r, height, width))
     moved = m.b.transpose(wide, (0, 1, 4, 2, 5, 3))
-    return Tensor(m.b.reshape(moved, (rows, channels // (r * r), height * r, width * r)))
+    return ScriptTensor(m.b.reshape(moved, (rows, channels // (r * r), height * r, width * r)))
 
 
 OPS: Mapping[str, Callable[..., Any]] = {

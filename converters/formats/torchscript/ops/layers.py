@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from export_model.converters.formats.torchscript.machine import Machine
-from export_model.converters.formats.torchscript.values import Tensor
+from export_model.converters.formats.torchscript.values import ScriptTensor
 from export_model.converters.graph.nn import normalisation, pooling
 from export_model.converters.graph.nn.activations import scale_and_shift
 from export_model.converters.graph.nn.convolution import Window, conv2d, conv2d_transposed
@@ -18,23 +18,23 @@ from export_model.converters.graph.types import BOOL, FLOAT32
 from export_model.signatures.errors import UnsupportedOpError
 
 
-def _linear(m: Machine, x: Any, weight: Any, bias: Any = None) -> Tensor:
+def _linear(m: Machine, x: Any, weight: Any, bias: Any = None) -> ScriptTensor:
     value, kernel = m.ref(x), m.ref(weight)
     m.expect(value, -1, m.b.length(kernel, -1))
     product = matmul(m.b, value, m.b.transpose(kernel, [1, 0]))
-    return Tensor(product if bias is None else m.b.add("BiasAdd", [product, m.ref(bias)]))
+    return ScriptTensor(product if bias is None else m.b.add("BiasAdd", [product, m.ref(bias)]))
 
 
-def _matmul(m: Machine, x: Any, y: Any) -> Tensor:
+def _matmul(m: Machine, x: Any, y: Any) -> ScriptTensor:
     left, right = m.ref(x), m.ref(y)
     m.expect(left, -1, m.b.length(right, max(m.b.rank(right) - 2, 0)))
-    return Tensor(matmul(m.b, left, right))
+    return ScriptTensor(matmul(m.b, left, right))
 
 
-def _addmm(m: Machine, bias: Any, x: Any, y: Any, beta: Any = 1, alpha: Any = 1) -> Tensor:
+def _addmm(m: Machine, bias: Any, x: Any, y: Any, beta: Any = 1, alpha: Any = 1) -> ScriptTensor:
     if (beta, alpha) != (1, 1):
         raise UnsupportedOpError("a product with factors", why="factors of 1 are known")
-    return Tensor(m.b.add("Add", list(m.pair(_matmul(m, x, y), bias))))
+    return ScriptTensor(m.b.add("Add", list(m.pair(_matmul(m, x, y), bias))))
 
 
 # ------------------------------------------------------------------ windows
@@ -80,14 +80,14 @@ def _as_image(m: Machine, x: Any, axes: int) -> str:
     return m.b.transpose(value, (0, 2, 3, 1))
 
 
-def _from_image(m: Machine, image: str, axes: int) -> Tensor:
+def _from_image(m: Machine, image: str, axes: int) -> ScriptTensor:
     value = m.b.transpose(image, (0, 3, 1, 2))
-    return Tensor(m.b.squeeze(value, [2]) if axes == 1 else value)
+    return ScriptTensor(m.b.squeeze(value, [2]) if axes == 1 else value)
 
 
 def _convolution(
     m: Machine, x: Any, weight: Any, bias: Any, stride: Any, padding: Any, dilation: Any, groups: Any
-) -> Tensor:
+) -> ScriptTensor:
     kernel, axes = _kernel(m, weight)
     m.expect(m.ref(x), 1, kernel.shape[1] * groups)
     window = _window(kernel.shape[-axes:], stride, padding, dilation)
@@ -104,7 +104,7 @@ def _kernel(m: Machine, weight: Any) -> tuple[np.ndarray, int]:
     return (kernel if axes == 2 else kernel[:, :, None, :]), axes
 
 
-def _biased_image(m: Machine, image: str, bias: Any, axes: int) -> Tensor:
+def _biased_image(m: Machine, image: str, bias: Any, axes: int) -> ScriptTensor:
     return _from_image(m, image if bias is None else m.b.add("BiasAdd", [image, m.ref(bias)]), axes)
 
 
@@ -117,7 +117,7 @@ def _conv(
     padding: Any = 0,
     dilation: Any = 1,
     groups: Any = 1,
-) -> Tensor:
+) -> ScriptTensor:
     return _convolution(
         m, x, weight=weight, bias=bias, stride=stride, padding=padding, dilation=dilation, groups=groups
     )
@@ -133,7 +133,7 @@ def _turn_convolution(
     output_padding: Any = 0,
     groups: Any = 1,
     dilation: Any = 1,
-) -> Tensor:
+) -> ScriptTensor:
     """The kernel is [in, out per group, …]."""
     kernel, axes = _kernel(m, weight)
     m.expect(m.ref(x), 1, kernel.shape[0])
@@ -156,7 +156,7 @@ def _traced_conv(
     output_padding: Any,
     groups: Any,
     *rest: Any,
-) -> Tensor:
+) -> ScriptTensor:
     if transposed:
         return _turn_convolution(
             m,
@@ -174,7 +174,7 @@ def _traced_conv(
     )
 
 
-def _max_pool(axes: int) -> Callable[..., Tensor]:
+def _max_pool(axes: int) -> Callable[..., ScriptTensor]:
     def translate(
         m: Machine,
         x: Any,
@@ -183,7 +183,7 @@ def _max_pool(axes: int) -> Callable[..., Tensor]:
         padding: Any = 0,
         dilation: Any = 1,
         ceil_mode: Any = False,
-    ) -> Tensor:
+    ) -> ScriptTensor:
         if ceil_mode:
             raise UnsupportedOpError("a pool with ceil_mode", why="what is beyond the edge is not known")
         window = _window(_numbers(kernel_size, axes), stride, padding, dilation)
@@ -192,7 +192,7 @@ def _max_pool(axes: int) -> Callable[..., Tensor]:
     return translate
 
 
-def _average_pool(axes: int) -> Callable[..., Tensor]:
+def _average_pool(axes: int) -> Callable[..., ScriptTensor]:
     def translate(
         m: Machine,
         x: Any,
@@ -202,7 +202,7 @@ def _average_pool(axes: int) -> Callable[..., Tensor]:
         ceil_mode: Any = False,
         count_include_pad: Any = True,
         divisor_override: Any = None,
-    ) -> Tensor:
+    ) -> ScriptTensor:
         if ceil_mode or divisor_override is not None:
             raise UnsupportedOpError("a pool with ceil_mode or a divisor", why="the plain mean is known")
         window = _window(_numbers(kernel_size, axes), stride, padding, 1)
@@ -217,23 +217,23 @@ def _average_pool(axes: int) -> Callable[..., Tensor]:
 
 def _layer_norm(
     m: Machine, x: Any, shape: Any, weight: Any = None, bias: Any = None, eps: Any = 1e-5, *rest: Any
-) -> Tensor:
+) -> ScriptTensor:
     value = m.ref(x)
     axis = m.b.rank(value) - len(shape)
     for at, length in enumerate(shape):
         m.expect(value, axis + at, length)
     scale = m.b.floats(np.ones(tuple(shape))) if weight is None else m.ref(weight)
     made, _, _ = normalisation.layer(m.b, value, axis, scale, None if bias is None else m.ref(bias), float(eps))
-    return Tensor(made)
+    return ScriptTensor(made)
 
 
-def _rms_norm(m: Machine, x: Any, shape: Any, weight: Any = None, eps: Any = None) -> Tensor:
+def _rms_norm(m: Machine, x: Any, shape: Any, weight: Any = None, eps: Any = None) -> ScriptTensor:
     """Without an epsilon that of float32 is taken (torch/nn/functional.py)."""
     value = m.ref(x)
     axis = m.b.rank(value) - len(shape)
     scale = m.b.floats(np.ones(tuple(shape))) if weight is None else m.ref(weight)
     least = float(np.finfo(np.float32).eps if eps is None else eps)
-    return Tensor(normalisation.rms(m.b, value, axis, scale, least))
+    return ScriptTensor(normalisation.rms(m.b, value, axis, scale, least))
 
 
 def _affine(m: Machine, weight: Any, bias: Any, channels: int) -> tuple[str, str]:
@@ -243,10 +243,10 @@ def _affine(m: Machine, weight: Any, bias: Any, channels: int) -> tuple[str, str
 
 def _group_norm(
     m: Machine, x: Any, groups: Any, weight: Any = None, bias: Any = None, eps: Any = 1e-5, *rest: Any
-) -> Tensor:
+) -> ScriptTensor:
     value = m.ref(x)
     scale, shift = _affine(m, weight, bias, m.b.length(value, 1))
-    return Tensor(normalisation.group(m.b, value, int(groups), scale, shift, float(eps)))
+    return ScriptTensor(normalisation.group(m.b, value, int(groups), scale, shift, float(eps)))
 
 
 def _instance_norm(
@@ -260,13 +260,13 @@ def _instance_norm(
     momentum: Any,
     eps: Any,
     *rest: Any,
-) -> Tensor:
+) -> ScriptTensor:
     """By the row's own statistics (``own``), or by stored ones, as a batch normalisation."""
     if not own:
         return _batch_norm(m, x, weight, bias, mean, variance, training=False, momentum=momentum, eps=eps)
     value = m.ref(x)
     scale, shift = _affine(m, weight, bias, m.b.length(value, 1))
-    return Tensor(normalisation.instance(m.b, value, scale, shift, float(eps)))
+    return ScriptTensor(normalisation.instance(m.b, value, scale, shift, float(eps)))
 
 
 def _attention(
@@ -279,7 +279,7 @@ def _attention(
     causal: Any = False,
     scale: Any = None,
     *rest: Any,
-) -> Tensor:
+) -> ScriptTensor:
     """Softmax(q·kᵀ·scale + mask)·v over the last two axes; ``causal``: no element sees those behind it."""
     if dropout:
         raise UnsupportedOpError("dropout of a module that is in training", why="call eval() before it is saved")
@@ -299,7 +299,7 @@ def _attention(
             scores = m.b.where(given, scores, m.b.number(scores, -np.inf))
         else:
             scores = m.b.add("Add", [scores, given])
-    return Tensor(matmul(m.b, m.b.add("Softmax", [scores]), v))
+    return ScriptTensor(matmul(m.b, m.b.add("Softmax", [scores]), v))
 
 
 def _batch_norm(
@@ -313,7 +313,7 @@ def _batch_norm(
     momentum: Any,
     eps: Any,
     *rest: Any,
-) -> Tensor:
+) -> ScriptTensor:
     if training:
         raise UnsupportedOpError("batch normalisation of a module in training", why="call eval() before it is saved")
     centre, spread = (m.constant_numbers(v, "its statistics") for v in (mean, variance))
@@ -322,7 +322,7 @@ def _batch_norm(
     value = m.b.cast(m.ref(x), FLOAT32)
     m.expect(value, 1, len(centre))
     with np.errstate(all="ignore"):
-        return Tensor(
+        return ScriptTensor(
             normalisation.batch(m.b, value, scale=scale, bias=shift, mean=centre, variance=spread, epsilon=float(eps))
         )
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from export_model.converters.formats.torchscript.machine import Machine
-from export_model.converters.formats.torchscript.values import Tensor
+from export_model.converters.formats.torchscript.values import ScriptTensor
 from export_model.converters.graph.nn import recurrent as nn
 from export_model.signatures.errors import UnsupportedOpError
 
@@ -70,7 +70,7 @@ def _layers(step: _Step, states: int) -> Callable[..., Any]:
         train: Any,
         bidirectional: Any,
         batch_first: Any,
-    ) -> tuple[Tensor, ...]:
+    ) -> tuple[ScriptTensor, ...]:
         if bidirectional:
             raise UnsupportedOpError("it reads its history backwards, too", why="an agent has none of what comes")
         if dropout and train:
@@ -94,7 +94,7 @@ def _layers(step: _Step, states: int) -> Callable[..., Any]:
             for kept, state in zip(after, now, strict=True):
                 kept.append(m.b.expand_dims(state, 0))
         output = m.b.concat([m.b.expand_dims(o, 1 if batch_first else 0) for o in inputs], 1 if batch_first else 0)
-        return (Tensor(output), *(Tensor(m.b.concat(kept, 0)) for kept in after))
+        return (ScriptTensor(output), *(ScriptTensor(m.b.concat(kept, 0)) for kept in after))
 
     return translate
 
@@ -119,7 +119,7 @@ def _cell(step: _Step) -> Callable[..., Any]:
         held = [m.ref(h) for h in (hx if isinstance(hx, list | tuple) else [hx])]
         for state in held:
             m.expect(state, -1, weights[1].shape[1])
-        made = [Tensor(r) for r in step(m, m.ref(x), held, weights)]
+        made = [ScriptTensor(r) for r in step(m, m.ref(x), held, weights)]
         return tuple(made) if len(made) > 1 else made[0]
 
     return translate

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from export_model.converters.formats.torchscript.machine import Machine
-from export_model.converters.formats.torchscript.values import Tensor
+from export_model.converters.formats.torchscript.values import ScriptTensor
 from export_model.converters.graph.nn.reduction import over_last_axis
 from export_model.converters.graph.types import FLOAT32, INT64
 from export_model.signatures.errors import UnsupportedOpError
@@ -18,27 +18,27 @@ def _axes(m: Machine, x: str, dim: Any) -> list[int]:
     return [m.b.axis(x, axis) for axis in wanted]
 
 
-def _reduce(op: str) -> Callable[..., Tensor]:
-    def translate(m: Machine, x: Any, dim: Any = None, keepdim: Any = False, dtype: Any = None) -> Tensor:
+def _reduce(op: str) -> Callable[..., ScriptTensor]:
+    def translate(m: Machine, x: Any, dim: Any = None, keepdim: Any = False, dtype: Any = None) -> ScriptTensor:
         value = m.b.cast(m.ref(x), FLOAT32)
-        return Tensor(m.b.reduce(op, value, _axes(m, value, dim), keep=bool(keepdim)))
+        return ScriptTensor(m.b.reduce(op, value, _axes(m, value, dim), keep=bool(keepdim)))
 
     return translate
 
 
-def _norm(m: Machine, x: Any, p: Any = 2, dim: Any = None, keepdim: Any = False, dtype: Any = None) -> Tensor:
+def _norm(m: Machine, x: Any, p: Any = 2, dim: Any = None, keepdim: Any = False, dtype: Any = None) -> ScriptTensor:
     value = m.b.cast(m.ref(x), FLOAT32)
     axes = _axes(m, value, dim)
     if p == 1:
-        return Tensor(m.b.reduce("Sum", m.b.add("Abs", [value]), axes, keep=bool(keepdim)))
+        return ScriptTensor(m.b.reduce("Sum", m.b.add("Abs", [value]), axes, keep=bool(keepdim)))
     if p not in (2, "fro", None):
         raise UnsupportedOpError("a norm of another order", why="1 and 2 are known")
     squares = m.b.reduce("Sum", m.b.add("Square", [value]), axes, keep=bool(keepdim))
-    return Tensor(m.b.add("Sqrt", [squares]))
+    return ScriptTensor(m.b.add("Sqrt", [squares]))
 
 
-def _variance(*, root: bool) -> Callable[..., Tensor]:
-    def translate(m: Machine, x: Any, dim: Any = None, unbiased: Any = True, keepdim: Any = False) -> Tensor:
+def _variance(*, root: bool) -> Callable[..., ScriptTensor]:
+    def translate(m: Machine, x: Any, dim: Any = None, unbiased: Any = True, keepdim: Any = False) -> ScriptTensor:
         value = m.b.cast(m.ref(x), FLOAT32)
         if isinstance(dim, bool):  # var(x, unbiased)
             dim, unbiased = None, dim
@@ -49,30 +49,30 @@ def _variance(*, root: bool) -> Callable[..., Tensor]:
         for axis in axes:
             count *= m.b.length(value, axis)
         made = m.b.add("RealDiv", [total, m.b.number(value, max(count - bool(unbiased), 1))])
-        return Tensor(m.b.add("Sqrt", [made]) if root else made)
+        return ScriptTensor(m.b.add("Sqrt", [made]) if root else made)
 
     return translate
 
 
-def _softmax(op: str) -> Callable[..., Tensor]:
-    def translate(m: Machine, x: Any, dim: Any, dtype: Any = None) -> Tensor:
+def _softmax(op: str) -> Callable[..., ScriptTensor]:
+    def translate(m: Machine, x: Any, dim: Any, dtype: Any = None) -> ScriptTensor:
         value = m.b.cast(m.ref(x), FLOAT32)
         rank, axis = m.b.rank(value), m.b.axis(value, dim)
         order = [i for i in range(rank) if i != axis] + [axis]
         back = [order.index(i) for i in range(rank)]
-        return Tensor(m.b.transpose(over_last_axis(m.b, op, m.b.transpose(value, order)), back))
+        return ScriptTensor(m.b.transpose(over_last_axis(m.b, op, m.b.transpose(value, order)), back))
 
     return translate
 
 
-def _best_place(op: str) -> Callable[..., Tensor]:
-    def translate(m: Machine, x: Any, dim: Any = None, keepdim: Any = False) -> Tensor:
+def _best_place(op: str) -> Callable[..., ScriptTensor]:
+    def translate(m: Machine, x: Any, dim: Any = None, keepdim: Any = False) -> ScriptTensor:
         value = m.ref(x)
         if dim is None:
             value, dim = m.b.reshape(value, (-1,)), 0
         axis = m.b.axis(value, dim)
         made = m.b.add(op, [value, m.b.ints(axis, "axis")], output_type=INT64)
-        return Tensor(m.b.expand_dims(made, axis) if keepdim else made)
+        return ScriptTensor(m.b.expand_dims(made, axis) if keepdim else made)
 
     return translate
 
@@ -81,8 +81,8 @@ def _best(kind: str) -> Callable[..., Any]:
     """``max(x)``, ``max(x, y)``, ``max(x, dim, keepdim)``, which gives the places, too."""
 
     def translate(m: Machine, x: Any, dim: Any = None, keepdim: Any = False) -> Any:
-        if isinstance(dim, Tensor):
-            return Tensor(m.b.add(f"{kind}imum", list(m.pair(x, dim))))
+        if isinstance(dim, ScriptTensor):
+            return ScriptTensor(m.b.add(f"{kind}imum", list(m.pair(x, dim))))
         values = _reduce(kind)(m, x, dim, keepdim)
         return values if dim is None else (values, _best_place(f"Arg{kind}")(m, x, dim, keepdim))
 

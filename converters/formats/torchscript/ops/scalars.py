@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from export_model.converters.formats.torchscript.machine import DTYPES, Machine
-from export_model.converters.formats.torchscript.values import Device, Tensor
+from export_model.converters.formats.torchscript.values import Device, ScriptTensor
 from export_model.converters.graph.types import BOOL, FLOAT32, INT64
 from export_model.signatures.errors import SourceError, UnsupportedOpError
 
@@ -18,7 +18,7 @@ _MAX_RANGE = 4096
 
 def _scalar(kind: Callable[[Any], Any]) -> Callable[[Machine, Any], Any]:
     def convert(m: Machine, value: Any) -> Any:
-        if isinstance(value, Tensor):
+        if isinstance(value, ScriptTensor):
             known = m.b.constant(value.read())
             if known is None or known.size != 1:
                 raise UnsupportedOpError("a number is taken out of a tensor", why="it depends on what is fed")
@@ -35,8 +35,8 @@ def _range(m: Machine, *bounds: int) -> range:
     return found
 
 
-def _number_to_tensor(m: Machine, value: Any) -> Tensor:
-    return value if isinstance(value, Tensor) else Tensor(m.ref(value))
+def _number_to_tensor(m: Machine, value: Any) -> ScriptTensor:
+    return value if isinstance(value, ScriptTensor) else ScriptTensor(m.ref(value))
 
 
 def _dtype(m: Machine, value: Any) -> int:
@@ -53,7 +53,7 @@ def _raise(m: Machine, message: Any = "", *rest: Any) -> None:
 
 
 def _length(m: Machine, value: Any) -> int:
-    return m.b.length(value.read(), 0) if isinstance(value, Tensor) else len(value)
+    return m.b.length(value.read(), 0) if isinstance(value, ScriptTensor) else len(value)
 
 
 def _append(m: Machine, items: list[Any], value: Any) -> list[Any]:

@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from export_model.converters.formats.torchscript.machine import Machine, unknown_length
 from export_model.converters.formats.torchscript.ops.scalars import dtype_of
-from export_model.converters.formats.torchscript.values import OpenLength, Put, Show, Tensor, View
+from export_model.converters.formats.torchscript.values import OpenLength, Put, ScriptTensor, Show, TensorView
 from export_model.converters.graph.types import FLOAT32, INT64, Dim
 from export_model.signatures.errors import UnsupportedOpError
 
@@ -21,12 +21,12 @@ _END = (1 << 63) - 1
 _MAX_PARTS = 1024
 
 
-def _view(x: Tensor, show: Show, put: Put | None = None) -> Tensor:
-    return View(x, show, put)
+def _view(x: ScriptTensor, show: Show, put: Put | None = None) -> ScriptTensor:
+    return TensorView(x, show, put)
 
 
-def _tensor(x: Any) -> Tensor:
-    if not isinstance(x, Tensor):
+def _tensor(x: Any) -> ScriptTensor:
+    if not isinstance(x, ScriptTensor):
         raise UnsupportedOpError(f"a {type(x).__name__} stands where a tensor is expected", why="it has no axes")
     return x
 
@@ -78,7 +78,7 @@ def _sliced_length(first: int | None, last: int | None) -> int | None:
     return last - (first or 0) if same_side and last > (first or 0) else None
 
 
-def _select(m: Machine, x: Any, dim: Any, index: Any) -> Tensor:
+def _select(m: Machine, x: Any, dim: Any, index: Any) -> ScriptTensor:
     x = _tensor(x)
     axis = m.b.axis(x.read(), dim)
     length = m.b.shape(x.read())[axis]
@@ -95,14 +95,14 @@ def _select(m: Machine, x: Any, dim: Any, index: Any) -> Tensor:
     return _view(x, lambda whole: m.b.squeeze(m.b.slice(whole, axis, at, end), [axis]), put)
 
 
-def _split_by(m: Machine, x: Any, sizes: Sequence[int], dim: Any) -> list[Tensor]:
+def _split_by(m: Machine, x: Any, sizes: Sequence[int], dim: Any) -> list[ScriptTensor]:
     ends = np.cumsum([0, *sizes]).tolist()
     if len(sizes) > _MAX_PARTS:
         raise UnsupportedOpError(f"it is cut into {len(sizes)} parts", why=f"up to {_MAX_PARTS} are known")
     return [_slice(m, x, dim, int(a), int(b)) for a, b in itertools.pairwise(ends)]
 
 
-def _split(m: Machine, x: Any, size: Any, dim: Any = 0) -> list[Tensor]:
+def _split(m: Machine, x: Any, size: Any, dim: Any = 0) -> list[ScriptTensor]:
     if isinstance(size, list | tuple):
         return _split_by(m, x, size, dim)
     length = m.b.length(_tensor(x).read(), dim)
@@ -112,27 +112,27 @@ def _split(m: Machine, x: Any, size: Any, dim: Any = 0) -> list[Tensor]:
     return _split_by(m, x, [size] * full + ([rest] if rest else []), dim)
 
 
-def _chunk(m: Machine, x: Any, chunks: Any, dim: Any = 0) -> list[Tensor]:
+def _chunk(m: Machine, x: Any, chunks: Any, dim: Any = 0) -> list[ScriptTensor]:
     return _split(m, x, -(-m.b.length(_tensor(x).read(), dim) // chunks), dim)
 
 
-def _unbind(m: Machine, x: Any, dim: Any = 0) -> list[Tensor]:
+def _unbind(m: Machine, x: Any, dim: Any = 0) -> list[ScriptTensor]:
     length = m.b.length(_tensor(x).read(), dim)
     if length > _MAX_PARTS:
         raise UnsupportedOpError(f"it is cut into {length} parts", why=f"up to {_MAX_PARTS} are known")
     return [_select(m, x, dim, i) for i in range(length)]
 
 
-def _index_select(m: Machine, x: Any, dim: Any, index: Any) -> Tensor:
+def _index_select(m: Machine, x: Any, dim: Any, index: Any) -> ScriptTensor:
     value = m.ref(x)
     places = [int(n) for n in m.constant_numbers(index, "which elements are taken").reshape(-1)]
     length = m.b.length(value, dim)
     if any(not -length <= n < length for n in places):
         raise UnsupportedOpError(f"an element beyond {length} is taken", why="there is none")
-    return Tensor(m.b.take(value, [n % length for n in places], m.b.axis(value, dim)))
+    return ScriptTensor(m.b.take(value, [n % length for n in places], m.b.axis(value, dim)))
 
 
-def _index(m: Machine, x: Any, indices: Any) -> Tensor:
+def _index(m: Machine, x: Any, indices: Any) -> ScriptTensor:
     """``x[:, index]`` with one list of places that is known."""
     given = [(axis, i) for axis, i in enumerate(indices) if i is not None]
     if len(given) != 1 or m.b.rank(m.ref(given[0][1])) != 1:
@@ -158,15 +158,15 @@ def _dims(m: Machine, x: str, wanted: Sequence[Any]) -> list[int]:
     return dims
 
 
-def _reshape(m: Machine, x: Any, shape: Any) -> Tensor:
+def _reshape(m: Machine, x: Any, shape: Any) -> ScriptTensor:
     x = _tensor(x)
     if isinstance(shape, int):
-        return Tensor(m.b.cast(x.read(), dtype_of(shape)))  # view(dtype)
+        return ScriptTensor(m.b.cast(x.read(), dtype_of(shape)))  # view(dtype)
     before, dims = m.b.shape(x.read()), _dims(m, x.read(), shape)
     return _view(x, lambda whole: m.b.reshape(whole, dims), lambda whole, part: m.b.reshape(part, before))
 
 
-def _flatten(m: Machine, x: Any, start: Any = 0, end: Any = -1) -> Tensor:
+def _flatten(m: Machine, x: Any, start: Any = 0, end: Any = -1) -> ScriptTensor:
     value = _tensor(x).read()
     shape = m.b.shape(value)
     first, last = m.b.axis(value, start), m.b.axis(value, end)
@@ -176,19 +176,19 @@ def _flatten(m: Machine, x: Any, start: Any = 0, end: Any = -1) -> Tensor:
     return _reshape(m, x, [*shape[:first], math.prod(inner), *shape[last + 1 :]])
 
 
-def _unflatten(m: Machine, x: Any, dim: Any, sizes: Sequence[Any]) -> Tensor:
+def _unflatten(m: Machine, x: Any, dim: Any, sizes: Sequence[Any]) -> ScriptTensor:
     value = _tensor(x).read()
     axis, dims = m.b.axis(value, dim), [*_size(m, x)]
     return _reshape(m, x, [*dims[:axis], *sizes, *dims[axis + 1 :]])
 
 
-def _unsqueeze(m: Machine, x: Any, dim: Any) -> Tensor:
+def _unsqueeze(m: Machine, x: Any, dim: Any) -> ScriptTensor:
     x = _tensor(x)
     axis = m.b.axis_of(dim, m.b.rank(x.read()) + 1)
     return _view(x, lambda whole: m.b.expand_dims(whole, axis), lambda whole, part: m.b.squeeze(part, [axis]))
 
 
-def _squeeze(m: Machine, x: Any, dim: Any = None) -> Tensor:
+def _squeeze(m: Machine, x: Any, dim: Any = None) -> ScriptTensor:
     given = _tensor(x)
     shape = m.b.shape(given.read())
     wanted = range(len(shape)) if dim is None else [dim] if isinstance(dim, int) else dim
@@ -204,14 +204,14 @@ def _squeeze(m: Machine, x: Any, dim: Any = None) -> Tensor:
     return _view(given, lambda whole: m.b.squeeze(whole, axes), put)
 
 
-def _permute(m: Machine, x: Any, dims: Sequence[Any]) -> Tensor:
+def _permute(m: Machine, x: Any, dims: Sequence[Any]) -> ScriptTensor:
     x = _tensor(x)
     order = [m.b.axis(x.read(), a) for a in dims]
     back = [order.index(i) for i in range(len(order))]
     return _view(x, lambda whole: m.b.transpose(whole, order), lambda whole, part: m.b.transpose(part, back))
 
 
-def _transpose(m: Machine, x: Any, first: Any, second: Any) -> Tensor:
+def _transpose(m: Machine, x: Any, first: Any, second: Any) -> ScriptTensor:
     value = _tensor(x).read()
     order = list(range(m.b.rank(value)))
     a, b = m.b.axis(value, first), m.b.axis(value, second)
@@ -219,7 +219,7 @@ def _transpose(m: Machine, x: Any, first: Any, second: Any) -> Tensor:
     return _permute(m, x, order)
 
 
-def _swap_axes(m: Machine, x: Any) -> Tensor:
+def _swap_axes(m: Machine, x: Any) -> ScriptTensor:
     given = _tensor(x)
     return _transpose(m, given, 0, 1) if m.b.rank(given.read()) > 1 else given
 
@@ -227,7 +227,7 @@ def _swap_axes(m: Machine, x: Any) -> Tensor:
 # ------------------------------------------------------------------ more elements
 
 
-def _cat(m: Machine, parts: Sequence[Any], dim: Any = 0) -> Tensor:
+def _cat(m: Machine, parts: Sequence[Any], dim: Any = 0) -> ScriptTensor:
     given = [m.ref(p) for p in parts]
     if any(m.b.dtype(r) != m.b.dtype(given[0]) for r in given):
         given = [m.b.cast(r, FLOAT32) for r in given]
@@ -238,81 +238,81 @@ def _cat(m: Machine, parts: Sequence[Any], dim: Any = 0) -> Tensor:
                 known, open_one = (its, given[0]) if isinstance(its, int) else (mine, other)
                 if isinstance(known, int):
                     m.expect(open_one, at, known)
-    return Tensor(m.b.concat(given, axis))
+    return ScriptTensor(m.b.concat(given, axis))
 
 
-def _stack(m: Machine, parts: Sequence[Any], dim: Any = 0) -> Tensor:
+def _stack(m: Machine, parts: Sequence[Any], dim: Any = 0) -> ScriptTensor:
     return _cat(m, [_unsqueeze(m, p, dim) for p in parts], dim)
 
 
-def _expand(m: Machine, x: Any, sizes: Sequence[Any], implicit: Any = False) -> Tensor:
+def _expand(m: Machine, x: Any, sizes: Sequence[Any], implicit: Any = False) -> ScriptTensor:
     value = _tensor(x).read()
     own = (1,) * (len(sizes) - m.b.rank(value)) + tuple(m.b.shape(value))
     dims = [o if n == -1 else n for o, n in zip(own, sizes, strict=True)]
-    return Tensor(m.b.broadcast(value, dims))
+    return ScriptTensor(m.b.broadcast(value, dims))
 
 
-def _expand_as(m: Machine, x: Any, other: Any) -> Tensor:
-    return Tensor(m.b.broadcast(m.ref(x), m.b.shape(m.ref(other))))
+def _expand_as(m: Machine, x: Any, other: Any) -> ScriptTensor:
+    return ScriptTensor(m.b.broadcast(m.ref(x), m.b.shape(m.ref(other))))
 
 
-def _repeat(m: Machine, x: Any, times: Sequence[Any]) -> Tensor:
+def _repeat(m: Machine, x: Any, times: Sequence[Any]) -> ScriptTensor:
     value = _tensor(x).read()
     own = (1,) * (len(times) - m.b.rank(value)) + tuple(m.b.shape(value))
-    return Tensor(m.b.add("Tile", [m.b.reshape(value, own), m.b.ints([int(n) for n in times], "times")]))
+    return ScriptTensor(m.b.add("Tile", [m.b.reshape(value, own), m.b.ints([int(n) for n in times], "times")]))
 
 
-def _full(m: Machine, shape: Sequence[Any], value: Any, dtype: Any = None, *rest: Any, **named: Any) -> Tensor:
+def _full(m: Machine, shape: Sequence[Any], value: Any, dtype: Any = None, *rest: Any, **named: Any) -> ScriptTensor:
     dims = [int(n) for n in shape]
     m.b.room(math.prod(dims))
     kind = (INT64 if isinstance(value, int) and not isinstance(value, bool) else FLOAT32) if dtype is None else None
-    return Tensor(m.b.const(np.full(dims, value, kind or dtype_of(dtype))))
+    return ScriptTensor(m.b.const(np.full(dims, value, kind or dtype_of(dtype))))
 
 
-def _zeros(value: float) -> Callable[..., Tensor]:
-    def translate(m: Machine, shape: Sequence[Any], dtype: Any = None, *rest: Any, **named: Any) -> Tensor:
+def _zeros(value: float) -> Callable[..., ScriptTensor]:
+    def translate(m: Machine, shape: Sequence[Any], dtype: Any = None, *rest: Any, **named: Any) -> ScriptTensor:
         return _full(m, shape, value, dtype if dtype is not None else 6)
 
     return translate
 
 
-def _like(value: float) -> Callable[..., Tensor]:
-    def translate(m: Machine, x: Any, dtype: Any = None, *rest: Any, **named: Any) -> Tensor:
+def _like(value: float) -> Callable[..., ScriptTensor]:
+    def translate(m: Machine, x: Any, dtype: Any = None, *rest: Any, **named: Any) -> ScriptTensor:
         like = m.ref(x)
         made = m.b.broadcast(m.b.number(like, value), m.b.shape(like))
-        return Tensor(made if dtype is None else m.b.cast(made, dtype_of(dtype)))
+        return ScriptTensor(made if dtype is None else m.b.cast(made, dtype_of(dtype)))
 
     return translate
 
 
-def _tensor_of(m: Machine, value: Any, dtype: Any = None, *rest: Any, **named: Any) -> Tensor:
+def _tensor_of(m: Machine, value: Any, dtype: Any = None, *rest: Any, **named: Any) -> ScriptTensor:
     """``torch.tensor`` of numbers."""
     array = np.array(value)
     if array.dtype.kind not in "biuf" or array.size > _MAX_PARTS:
         raise UnsupportedOpError("a tensor must be made of a list of numbers", why="its code is damaged")
     kind = {"f": FLOAT32, "b": array.dtype}.get(array.dtype.kind, INT64) if dtype is None else dtype_of(dtype)
-    return Tensor(m.b.const(array.astype(kind)))
+    return ScriptTensor(m.b.const(array.astype(kind)))
 
 
-def _arange(m: Machine, *given: Any, **named: Any) -> Tensor:
+def _arange(m: Machine, *given: Any, **named: Any) -> ScriptTensor:
     bounds = [n for n in given if isinstance(n, int) and not isinstance(n, bool)]
     start, end = (0, bounds[0]) if len(given) < 2 or given[1] is None else (bounds[0], bounds[1])
     m.b.room(end - start)
-    return Tensor(m.b.const(np.arange(start, end)))
+    return ScriptTensor(m.b.const(np.arange(start, end)))
 
 
-def _to(m: Machine, x: Any, *given: Any, **named: Any) -> Tensor:
+def _to(m: Machine, x: Any, *given: Any, **named: Any) -> ScriptTensor:
     """``x.to(…)``: another dtype where one is named, or that of another tensor; a device makes no difference."""
     x = _tensor(x)
     asked = [v for v in (named.get("dtype"), *given[:2]) if isinstance(v, int) and not isinstance(v, bool)]
-    other = next((v for v in given[:1] if isinstance(v, Tensor)), None)
+    other = next((v for v in given[:1] if isinstance(v, ScriptTensor)), None)
     if other is not None:
         return _cast(m, x, m.b.dtype(other.read()))
     return _cast(m, x, dtype_of(asked[0])) if asked else x
 
 
-def _cast(m: Machine, x: Tensor, dtype: np.dtype[Any]) -> Tensor:
-    return x if m.b.dtype(x.read()) == dtype else Tensor(m.b.cast(x.read(), dtype))
+def _cast(m: Machine, x: ScriptTensor, dtype: np.dtype[Any]) -> ScriptTensor:
+    return x if m.b.dtype(x.read()) == dtype else ScriptTensor(m.b.cast(x.read(), dtype))
 
 
 def _size(m: Machine, x: Any, dim: Any = None) -> Any:
@@ -335,8 +335,8 @@ def _same(m: Machine, x: Any, *given: Any, **named: Any) -> Any:
     return x
 
 
-def _copy(m: Machine, x: Any, *given: Any, **named: Any) -> Tensor:
-    return Tensor(m.ref(x))
+def _copy(m: Machine, x: Any, *given: Any, **named: Any) -> ScriptTensor:
+    return ScriptTensor(m.ref(x))
 
 
 OPS: Mapping[str, Callable[..., Any]] = {
