@@ -138,7 +138,7 @@ def _recording(
     signature: PolicySignature, steps: Sequence[Feeds], answers: Sequence[Mapping[str, Array]], heads: Mapping[str, str]
 ) -> Recording:
     """The steps as an agent's log has them: those of one episode in a row."""
-    memories = {s.name for s in signature.inputs if s.role is Role.MEMORY_IN}
+    memories = {signature.recurrence[0]} if signature.recurrence else set[str]()  # one not given back is fed as any
     batched = [s.name for s in signature.inputs if s.batched and s.name not in memories]
     inputs: dict[str, Array] = {n: np.concatenate([feeds[n] for feeds in steps]) for n in batched}
     inputs |= {s.name: steps[0][s.name] for s in signature.inputs if not s.batched}

@@ -40,10 +40,14 @@ class Replay(Struct, frozen=True):
         """The outputs, [rows, …].
 
         ``inputs`` that hold the memory are fed as they are; without, it is fed back as ``use`` says, along ``before``
-        (or ``last``).
+        (or ``last``). A memory that the policy does not give back is zero, as at the start of an episode.
         """
         pair = self.signature.recurrence
-        if pair is None or pair[0] in inputs:
+        if pair is None:
+            lost = [s for s in self.signature.inputs if s.role is Role.MEMORY_IN and s.name not in inputs]
+            zeros = {s.name: np.zeros((len(before), *(n or 1 for n in s.shape[1:])), np.float32) for s in lost}
+            return self._at_once({**inputs, **zeros}, self.fetch)
+        if pair[0] in inputs:
             return self._at_once(inputs, self.fetch)
         return self._step_by_step(inputs, last if use is MemoryUse.NOT_RESET else before, use, *pair)
 

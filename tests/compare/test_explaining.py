@@ -15,7 +15,7 @@ from export_model.exporter.compare.explaining import in_sides
 from export_model.exporter.export.pipeline import ExportOptions, export
 from export_model.exporter.logs import causes
 from fixtures import path as fixture
-from tests.compare.planted import ACTOR, PAIRS, Edit, before_input, compared, is_named, other_weights
+from tests.compare.planted import ACTOR, LSTM, PAIRS, Edit, before_input, compared, is_named, other_weights
 from tests.comparing import compare_artefacts
 
 CONTINUOUS = ACTOR.path
@@ -82,3 +82,21 @@ def test_what_nothing_explains_has_no_name(tmp_path: Path, pool: RuntimePool) ->
 
 def test_the_same_policy_is_not_explained(pool: RuntimePool) -> None:
     assert sentences(CONTINUOUS, CONTINUOUS, pool) == []
+
+
+def lose_memory(model: onnx.ModelProto) -> None:
+    """Take the memory that is given back out of the outputs, as BC of ML-Agents 0.3 did."""
+    kept = [o for o in model.graph.output if o.name not in ("recurrent_out", "memory_size")]
+    del model.graph.output[:]
+    model.graph.output.extend(kept)
+
+
+@pytest.mark.parametrize("wrong", [False, True])
+def test_a_memory_that_is_not_given_back_is_fed(wrong: bool, tmp_path: Path, pool: RuntimePool) -> None:
+    """A file beside itself failed: the search for a cause left it out, which counted as the candidate's failure."""
+    own = planted(LSTM.path, tmp_path / "own.onnx", lose_memory)
+    edit = before_input("Gather", np.array([0, 3, 2, 1, 4]), axis=1)
+    named = sentences(own, planted(own, tmp_path / "other.onnx", edit) if wrong else own, pool)
+    assert [("state[1], state[3] exchanged" in sentence) for sentence in named] == [True] * wrong
+    if not wrong:
+        assert compare_artefacts(own, own, runtimes="onnxruntime", pool=pool).passed

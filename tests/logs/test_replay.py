@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from export_model.exporter.acting.loading import load_policy
 from export_model.exporter.logs.recording import NONE
@@ -109,3 +110,19 @@ def test_an_episode_of_a_hundred_thousand_steps_takes_seconds_of_the_processor()
         given = {n: a[row:][:1] for n, a in feeds.items()}
         memory = policy.run({**given, pair[0]: memory}, [pair[1]])[pair[1]]
     np.testing.assert_allclose(found[-1:], memory, atol=1e-6)
+
+
+def test_a_memory_that_is_not_given_back_is_zero() -> None:
+    policy = load_policy(HALLWAY, runtime="numpy")
+    pair = policy.signature.recurrence
+    assert pair is not None
+    outputs = tuple(s for s in policy.signature.outputs if s.name != pair[1])
+    signature = replace(policy.signature, outputs=outputs, memory=None)
+    assert signature.recurrence is None
+    rows = {s.name: np.ones((3, *(n or 1 for n in s.shape[1:])), s.dtype) for s in signature.inputs}
+    name = next(s.name for s in outputs if s.dtype == "float32")
+    wanted = policy.run({**rows, pair[0]: np.zeros_like(rows[pair[0]])}, [name])[name]
+    given = {n: a for n, a in rows.items() if n != pair[0]}
+    before, last = links([3])
+    found = Replay(policy.run, signature, (name,)).answers(given, before, last)[name]  # type: ignore[arg-type]
+    np.testing.assert_array_equal(found, wanted)
