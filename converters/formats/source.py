@@ -91,6 +91,8 @@ class SourceModel(Struct, frozen=True):
     name: str | None = None
     original: OriginalRun | None = None
     producer: str = ""
+    #: samplers whose seed the graph does not keep draw alike after every start
+    seeded: bool = False
 
 
 #: What ``--set normaliser=`` is given to leave it out.

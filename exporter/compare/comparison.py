@@ -19,10 +19,11 @@ from msgspec import Struct, field
 from msgspec.structs import replace
 
 from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.compiler.passes.noise import has_seeds
 from export_model.converters.compiler.passes.weights import Storage
 from export_model.converters.files.children.process import LoadedModel, RunFailedError
 from export_model.converters.files.folders import scratch_folder, size_of
-from export_model.converters.formats.source import OriginalRun, ReadOptions
+from export_model.converters.formats.source import ReadOptions, SourceModel
 from export_model.converters.interfaces.differences import interface_differences
 from export_model.converters.policy.policy import Policy
 from export_model.converters.runtimes.pool import RuntimePool, chosen_runtimes, unverified_error
@@ -51,7 +52,7 @@ from export_model.exporter.verify.reference import random_outputs
 from export_model.exporter.verify.report import ParityReport
 from export_model.exporter.verify.session import Session
 from export_model.exporter.verify.tolerances import Tolerance, check_rules
-from export_model.exporter.verify.verification import CHECKS, Judge, verify
+from export_model.exporter.verify.verification import Judge, verify
 from export_model.signatures.errors import UsageError, naming
 from export_model.signatures.sampling import draw_cases
 
@@ -103,7 +104,7 @@ def compare_artefacts(
         given = [candidates] if isinstance(candidates, Path | str) else candidates
         reference = opened.enter_context(nearby(Path(reference)))
         near = [opened.enter_context(nearby(Path(path))) for path in given]
-        policy, source = _reference(reference, options.understanding, options.read)
+        model, policy = _reference(reference, options.understanding, options.read)
         if understood is not None:
             understood(policy)
         reads = options.candidate_read, options.candidate_understanding
@@ -113,8 +114,8 @@ def compare_artefacts(
         running = opened.enter_context(RuntimePool()) if pool is None else pool
         session = Session(used, known, running, judging, progress)
         explaining = Explaining()
-        judge = judge or partial(verify, checks=(*CHECKS, explaining))
-        comparison = _Comparison(policy, source, session, judge, Path(opened.enter_context(scratch_folder())))
+        judge = judge or partial(verify, checks=(explaining,))
+        comparison = _Comparison(policy, model, session, judge, Path(opened.enter_context(scratch_folder())))
         report = comparison.report(matched, rounded_to(reference))
     report = report.with_findings(finding for m in matched for finding in _interface_findings(policy, m))
     notes = [note for m in matched for note in (*m.notes(policy, used), *_interface_notes(policy, m))]
@@ -146,7 +147,7 @@ class _Comparison(Struct, frozen=True):
     """A reference, the runtimes that candidates run in, and what is made of them."""
 
     policy: Policy
-    source: OriginalRun | None
+    model: SourceModel
     session: Session
     judge: Judge
     folder: Path
@@ -161,7 +162,13 @@ class _Comparison(Struct, frozen=True):
             chosen = [copy for copy, of in zip(copies, kept, strict=True) if of == storage]
             sizes = {m.label: size_of(m.path) for m, _ in chosen}
             tested = policy_under_test(
-                self.policy, {}, self.folder, sizes=sizes, reference=reference, source=self.source
+                self.policy,
+                {},
+                self.folder,
+                sizes=sizes,
+                reference=reference,
+                source=self.model.original,
+                seeded=self.model.seeded or has_seeds(self.model.graph),
             )
             compared = partial(self._compare, chosen)
             if storage is None:
@@ -221,7 +228,7 @@ def _check_options(
 
 def _reference(
     path: Path, understanding: CompileOptions | None, read: ReadOptions | None
-) -> tuple[Policy, OriginalRun | None]:
+) -> tuple[SourceModel, Policy]:
     found = list(read_source(path, read).compile_models(understanding))
     if len(found) > 1:
         raise UsageError(
@@ -230,8 +237,7 @@ def _reference(
             why=", ".join(p.name for _, p in found),
             fix="choose one with --brain, or give one model of it",
         )
-    model, policy = found[0]
-    return policy, model.original
+    return found[0]
 
 
 def _safe_copy(candidate: AnyCandidate, folder: Path) -> Path:

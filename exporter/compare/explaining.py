@@ -19,6 +19,7 @@ from export_model.exporter.logs.trials import Trials
 from export_model.exporter.verify.findings import Finding
 from export_model.exporter.verify.participants import Feeds, Participant, Run
 from export_model.exporter.verify.trial import Trial
+from export_model.exporter.verify.verification import CHECKS, Check
 from export_model.exporter.verify.work import products
 from export_model.signatures.roles import Role
 from export_model.signatures.sampling import draw_rollout
@@ -64,17 +65,19 @@ _WORDS = (
 
 
 class Explaining:
-    """A check that finds nothing wrong by itself: ``notes`` gets a sentence where one cause explains a difference."""
+    """Other checks, and where one of them fails, one cause that explains the difference: a sentence in ``notes``."""
 
-    def __init__(self) -> None:
+    def __init__(self, checks: Sequence[Check] = CHECKS) -> None:
         self.notes: list[str] = []
+        self._checks = checks
 
     def __call__(self, trial: Trial, participant: Participant) -> Iterator[Finding]:
-        """Explain what a participant's actions are, if they are not the reference's."""
+        """Put a participant through the checks; explain what its actions are, if they are not the reference's."""
+        findings = [finding for check in self._checks for finding in check(trial, participant)]
+        yield from findings
         heads = _shared_actions(trial, participant)
-        if heads and products(trial.tested.graph) <= _MOST_PRODUCTS:
+        if heads and not all(f.passed for f in findings) and products(trial.tested.graph) <= _MOST_PRODUCTS:
             self.notes += _explanations(trial, participant, heads)
-        yield from ()
 
 
 def _shared_actions(trial: Trial, participant: Participant) -> dict[str, str]:
@@ -91,7 +94,8 @@ def _shared_actions(trial: Trial, participant: Participant) -> dict[str, str]:
 def _explanations(trial: Trial, participant: Participant, heads: Mapping[str, str]) -> Iterator[str]:
     signature, label = trial.signature, participant.name
     pair = signature.recurrence
-    if pair is not None and pair[1] not in participant.outputs:
+    memories = [s.name for s in signature.inputs if s.role is Role.MEMORY_IN]
+    if memories != list(pair[:1] if pair else ()) or (pair is not None and pair[1] not in participant.outputs):
         return
     steps = draw_rollout(signature, seed=trial.options.seed, steps=_STEPS, batch=_EPISODES)
     for feeds in steps:  # without chance

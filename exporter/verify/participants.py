@@ -68,6 +68,8 @@ class PolicyUnderTest(Struct, frozen=True, kw_only=True):
     runs_elsewhere: bool = False
     #: the policy before its action was baked: the source answers as that, and the judge applies what is stated
     before: Policy | None = None
+    #: the source's own samplers begin alike after every start: so may what it is held against
+    seeded: bool = False
 
 
 def write_reference(policy: Policy, folder: Path, name: str = "reference") -> Path:
@@ -94,6 +96,7 @@ def policy_under_test(
     code: CodeOptions | None = None,
     runs_elsewhere: bool = False,
     before: Policy | None = None,
+    seeded: bool = False,
 ) -> PolicyUnderTest:
     """Return what is verified of a policy and its ``artefacts`` (format → path that a loader is given).
 
@@ -119,6 +122,7 @@ def policy_under_test(
         code=code or CodeOptions(),
         runs_elsewhere=runs_elsewhere,
         before=before,
+        seeded=seeded,
     )
 
 

@@ -41,6 +41,11 @@ def clear_seeds(graph: Graph) -> Graph:
     return Graph(tuple(nodes))
 
 
+def has_seeds(graph: Graph) -> bool:
+    """Whether a sampler has the seed of a trainer's run: it draws alike after every start."""
+    return any(traits(n).sampler and (n.attrs.get("seed") or n.attrs.get("seed2")) for n in graph.nodes)
+
+
 def settle_noise(c: Compilation) -> Compilation:
     """Noise as the options say, and a note of what it was."""
     drawn = [n.name for n in samplers(c.graph)]

@@ -57,7 +57,7 @@ def lift_draws(model: Any, draws: Collection[str] | Mapping[str, int]) -> Any:
     nodes: list[Any] = []
     for node in graph.node:
         if node.op_type not in _KINDS or not wanted.intersection(node.output):
-            _repair_seed(node)
+            repair_seed(node)
             nodes.append(node)
             continue
         (name,) = node.output
@@ -78,7 +78,8 @@ def lift_draws(model: Any, draws: Collection[str] | Mapping[str, int]) -> Any:
     return model
 
 
-def _repair_seed(node: Any) -> None:
+def repair_seed(node: Any) -> None:
+    """Make an integer seed (tf2onnx 1.5.5) the float that ONNX says, in place."""
     for attribute in node.attribute:
         if attribute.name == "seed" and attribute.type == _INT:
             attribute.f, attribute.type = float(attribute.i), _FLOAT

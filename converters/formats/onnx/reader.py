@@ -60,6 +60,8 @@ class OnnxModel(Struct, frozen=True):
     one_row: bool = False
     #: a sampler's seed is an integer where ONNX says float
     integer_seeds: bool = False
+    #: its samplers draw alike after every start
+    seeded: bool = False
     doubles: bool = False
     #: node → shape, for inputs and outputs
     shapes: Mapping[str, tuple[Dim, ...] | None] = field(default_factory=dict)
@@ -111,6 +113,7 @@ def read_onnx(given: Fetched, repair: str | None = None) -> OnnxModel:
         left_out=left_out,
         kinds=frozenset(n.op_type for n in all_nodes(graph)),
         one_row=importer.one_row,
+        seeded=any(a.name == "seed" for n in graph.node for a in n.attribute),
         integer_seeds=any(a.name == "seed" and a.type == _INT for n in graph.node for a in n.attribute),
         doubles=any(t.data_type == _DOUBLE for t in tensors(graph))
         or any(v.type.tensor_type.elem_type == _DOUBLE for v in declared),

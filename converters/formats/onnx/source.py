@@ -25,4 +25,5 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
     copy = partial(safe_copy, given.path, [], repair=options.repair) if copied else None
     original = OriginalRun("onnxruntime", given.path, {"lift": list(model.draws)}, copy=copy)
     producer = f"{model.producer}, opset {model.opset}" if model.producer else f"opset {model.opset}"
-    return [SourceModel(graph, model.files, facts, original=original, producer=producer)]
+    seeded = model.seeded
+    return [SourceModel(graph, model.files, facts, original=original, producer=producer, seeded=seeded)]

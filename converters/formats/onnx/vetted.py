@@ -14,6 +14,7 @@ from typing import Any
 
 from export_model.converters.files.external_data import Detached
 from export_model.converters.files.fetch import Fetched, read_bytes
+from export_model.converters.formats.onnx.edit import repair_seed
 from export_model.converters.formats.onnx.exporters import repair_model
 from export_model.converters.formats.onnx.messages import files_of
 from export_model.converters.formats.onnx.proto import decode_model, inside, load_external
@@ -70,6 +71,7 @@ def self_contained_model(path: Path, detached: Detached | None = None) -> Any:
         for node in inside(part, "NodeProto"):
             if not _computes(node.domain, node.op_type, own):
                 raise _op_error(node)
+            repair_seed(node)
     for value in (*model.graph.input, *model.graph.output):
         for length in value.type.tensor_type.shape.dim:
             if length.HasField("dim_value") and length.dim_value <= 0:  # free, as the importer has it

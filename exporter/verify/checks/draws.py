@@ -194,6 +194,9 @@ def _repetitions(trial: Trial, participant: Participant, names: Sequence[str]) -
     called = _alike(one, other, telling)
     said = {n: CALLED_ALIKE + _which(trial, n, columns) for n, columns in called.items()}
     starts = _starts(trial, participant, pair[0], names, telling)
+    if starts and trial.tested.seeded:
+        trial.remarks[f"{participant.name}: {STARTED_ALIKE}, as the reference's has"] = None
+        starts = {}
     return {**said, **{n: STARTED_ALIKE + _which(trial, n, columns) for n, columns in starts.items()}}
 
 
