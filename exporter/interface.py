@@ -8,9 +8,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
-from msgspec.structs import replace
-
-from export_model.exporter.acting.loading import load_as
+from export_model.exporter.acting.loading import load_policy
 from export_model.exporter.acting.policy import LoadedPolicy
 from export_model.exporter.compare.comparison import CompareOptions, compare_artefacts
 from export_model.exporter.export.again import verify_folder
@@ -72,7 +70,7 @@ def export(
         (result,) = export_model.export("3DBall.bytes", "out", to="onnx,tfjs")
         print(result.passed, result.folder, result.policy.signature.inputs)
     """
-    read, write, judging = read or ReadOptions(), write or WriteOptions(), judged_by(verify)
+    read, write, judging = read or ReadOptions(), write or WriteOptions(), _judged_by(verify)
     options = ExportOptions(
         out=Path(out),
         targets=[t for t in to.split(",") if t] if isinstance(to, str) else to,
@@ -106,11 +104,9 @@ def export(
     return results
 
 
-def judged_by(verify: str | Sequence[str] | VerifyOptions, options: VerifyOptions | None = None) -> VerifyOptions:
+def _judged_by(verify: str | Sequence[str] | VerifyOptions) -> VerifyOptions:
     """Return the options of a verification that was asked for by runtimes or by options."""
-    if isinstance(verify, VerifyOptions):
-        return verify
-    return replace(options or VerifyOptions(), runtimes=verify)
+    return verify if isinstance(verify, VerifyOptions) else VerifyOptions(runtimes=verify)
 
 
 @contextmanager
@@ -151,7 +147,7 @@ def load(
         action = policy.decide(observation, deterministic=True).action
     """
     read = read or ReadOptions()
-    return load_as(Path(source), runtime, seed, compile_options(read), read.for_reader())
+    return load_policy(Path(source), runtime, seed, compile_options(read), read.for_reader())
 
 
 def inspect(source: Path | str, *, read: ReadOptions | None = None, why: bool = False) -> Inspection:
@@ -187,7 +183,7 @@ def verify(
         report = export_model.verify("out/3DBall", source="3DBall.bytes", verify=["onnxruntime"])
         print(report.verdict, report.failures)
     """
-    read, judging = read or ReadOptions(), judged_by(verify)
+    read, judging = read or ReadOptions(), _judged_by(verify)
     with ExitStack() as fetched:
         return verify_folder(
             fetched.enter_context(nearby(Path(bundle))),
@@ -225,7 +221,7 @@ def compare(
     read = read or ReadOptions()
     options = CompareOptions(
         names=names or {},
-        judging=judged_by(verify),
+        judging=_judged_by(verify),
         understanding=compile_options(read),
         read=read.for_reader(),
         candidate_understanding=None if candidate_read is None else compile_options(candidate_read),
@@ -274,5 +270,5 @@ def play(
         names=names,
         understanding=compile_options(read),
         read=read.for_reader(),
-        judging=judged_by(verify),
+        judging=_judged_by(verify),
     )

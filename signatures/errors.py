@@ -1,4 +1,4 @@
-"""The exception tree. Every error the package raises on purpose is one of these.
+"""The exception tree. Every error the package raises on purpose is one of these, a name of ``export_model``.
 
 ::
 
@@ -182,6 +182,10 @@ class RuntimeUnavailableError(ExportModelError):
 
     exit_status = 3
 
+
+# A user meets them as those of the package: in a traceback, and where he catches one.
+for _class in [c for c in globals().values() if isinstance(c, type) and issubclass(c, ExportModelError)]:
+    _class.__module__ = "export_model"
 
 #: What Python and numpy raise where a damaged graph breaks something that a step takes for granted.
 _BROKEN = (

@@ -11,9 +11,9 @@ import pytest
 from export_model.converters.files.external_data import LARGE_FILE
 from export_model.converters.files.fetch import read_bytes
 from export_model.converters.files.memory_mapped import Mapped
-from export_model.exporter import export_model
 from export_model.signatures.errors import DamagedFileError, SourceError
 from fixtures import path as fixture
+from tests.exporting import export_model
 
 
 def test_a_large_file_is_a_view_which_outlives_being_let_go(tmp_path: Path) -> None:

@@ -13,10 +13,10 @@ from export_model.converters.files import tensorflow_messages as schema
 from export_model.converters.files.chunks import Pieces, equal
 from export_model.converters.files.external_data import LARGE, LARGE_FILE, Detached
 from export_model.converters.formats.frozen_graph.reader import read_graph
-from export_model.exporter import export_model
 from export_model.signatures.digest import sha256_hex
 from export_model.signatures.errors import DamagedFileError
 from tests.bench.big_policies import KINDS
+from tests.exporting import export_model
 from tests.handmade import constant, graph_def
 
 WIDE = np.arange(5 << 18, dtype=np.float32).reshape(1 << 10, -1)

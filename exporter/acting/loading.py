@@ -28,27 +28,20 @@ RUNTIMES = ("onnxruntime", "numpy")
 
 
 def load_policy(
-    source: Path | str, *, runtime: str | None = None, seed: int = 0, brain: str | None = None
+    source: Path | str,
+    runtime: str | None = None,
+    seed: int = 0,
+    compiling: CompileOptions | None = None,
+    read: ReadOptions | None = None,
 ) -> LoadedPolicy:
-    """Load a policy that acts in this process: ``export_model.load``, where ``brain`` chooses one of several policies.
+    """Load the policy of a bundle or a source, read as the options say. A bundle's file is checked by its hash.
 
-    Raises BundleError, RuntimeUnavailableError, UsageError, and for a source what an export would raise::
-
-        policy = load_policy("exported/3DBall")
-        action = policy.decide(observation, deterministic=True).action
+    Raises BundleError, RuntimeUnavailableError, UsageError, and for a source what an export would raise.
     """
-    from export_model.converters.compiler.options import CompileOptions
-
-    return load_as(Path(source), runtime, seed, CompileOptions(brain=brain))
-
-
-def load_as(
-    path: Path, runtime: str | None, seed: int, compiling: CompileOptions, read: ReadOptions | None = None
-) -> LoadedPolicy:
-    """Load the policy of a bundle or a source, read as the options say. A bundle's file is checked by its hash."""
     from export_model.converters.compiler.options import CompileOptions
     from export_model.converters.formats.source import ReadOptions
 
+    path, compiling = Path(source), compiling or CompileOptions()
     if runtime not in (None, *RUNTIMES):
         raise UsageError(f"runtime={runtime!r}: must be one of {', '.join(RUNTIMES)}")
     if path.is_dir() and (path / POLICY).exists():

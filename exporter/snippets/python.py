@@ -1,4 +1,4 @@
-"""Snippets in Python: onnxruntime, TensorFlow, ``load_policy``; and the pieces that TF Serving's use."""
+"""Snippets in Python: onnxruntime, TensorFlow, ``export_model.load``; and the pieces that TF Serving's use."""
 
 from __future__ import annotations
 

@@ -8,11 +8,11 @@ from pathlib import Path
 from msgspec.structs import replace
 
 from export_model.converters.formats.registry import DEFAULTS
-from export_model.exporter import export_model
 from export_model.exporter.export.pipeline import ExportOptions, export
 from export_model.exporter.snippets.contract import SnippetBundle, read_bundle
 from export_model.exporter.snippets.registry import snippets
 from fixtures import path as fixture
+from tests.exporting import export_model
 
 KINDS = ("continuous", "discrete", "sampled", "recurrent", "visual", "twobrains")
 NAMES = (*KINDS[:-1], "twobrains-StrikerBrain", "twobrains-Goalie-Brain-2", "own-names-Goalie-Brain-2")

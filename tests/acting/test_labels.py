@@ -11,13 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from export_model.converters.compiler.options import CompileOptions
-from export_model.exporter import export_model
 from export_model.exporter.export.pipeline import ExportOptions, export
 from export_model.exporter.export.sources import read_source
 from export_model.signatures.errors import DamagedFileError, UsageError
 from export_model.signatures.labels import parse_labels, remaining
 from fixtures import path as fixture
 from tests.commands import export_model as run
+from tests.exporting import export_model
 
 DISCRETE: dict[str, Any] = {
     "observations": {"state": [f"ray {i}" for i in range(10)]},

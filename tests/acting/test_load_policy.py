@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from onnx import helper, numpy_helper
 
-from export_model.exporter import export_model, load_policy
 from export_model.exporter.acting.policy import LoadedPolicy
 from export_model.exporter.verify.statistics import FALSE_ALARM, fit
 from export_model.signatures.errors import BundleError, RuntimeUnavailableError, UsageError
@@ -20,6 +19,7 @@ from export_model.signatures.sampling import draw_cases
 from export_model.signatures.spec import PolicySignature, TensorSpec
 from fixtures import path as fixture
 from tests.acting.bundles import Bundles
+from tests.exporting import export_model, load_policy
 
 NAMES = ("continuous", "discrete", "sampled", "recurrent", "visual")
 Load = Callable[..., LoadedPolicy]

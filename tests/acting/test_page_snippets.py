@@ -20,10 +20,10 @@ import numpy as np
 import pytest
 
 from export_model.converters.runtimes.javascript.node import js_home, node_executable
-from export_model.exporter import load_policy
 from export_model.exporter.snippets.packages import CDN, PACKAGES, TFJS, Package
 from tests.acting.snippet_bundles import NAMES, code_of
 from tests.commands import ROOT
+from tests.exporting import load_policy
 
 LOCKED = ROOT / "converters" / "runtimes" / "javascript" / "js"
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")

@@ -12,12 +12,12 @@ import pytest
 
 from export_model.converters.runtimes.javascript.node import js_home, node_executable
 from export_model.converters.runtimes.registry import available_runtimes
-from export_model.exporter import load_policy
 from export_model.exporter.acting.generator import Generator
 from export_model.exporter.acting.policy import Decision, LoadedPolicy
 from export_model.signatures.roles import Role
 from tests.acting.bundles import Bundles
 from tests.acting.test_load_policy import NAMES, observed
+from tests.exporting import load_policy
 
 DRIVER = Path(__file__).with_name("drive.mjs")
 KINDS = {"tfjs": "tfjs-cpu", "onnx": "onnxruntime-web"}

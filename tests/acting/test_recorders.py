@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from export_model.converters.runtimes.csharp import tools
-from export_model.exporter import load_policy
 from export_model.exporter.acting.policy import LoadedPolicy
 from export_model.exporter.export.pipeline import ExportOptions, export
 from export_model.exporter.logs.check import check_log
@@ -21,6 +20,7 @@ from export_model.exporter.snippets.contract import read_bundle
 from export_model.exporter.snippets.registry import snippets
 from export_model.signatures.roles import Role
 from tests.commands import ROOT
+from tests.exporting import load_policy
 
 TRAINED = ROOT / "fixtures" / "trained"
 EPISODES, LENGTH = 4, 25

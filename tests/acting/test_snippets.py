@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 
 from export_model.converters.formats.registry import DEFAULTS
-from export_model.exporter import export_model, load_policy
 from export_model.exporter.acting.policy import LoadedPolicy
 from export_model.exporter.export.pipeline import ExportOptions, export
 from export_model.exporter.snippets.contract import read_bundle
@@ -28,6 +27,7 @@ from fixtures import path as fixture
 from tests.acting.snippet_bundles import NAMES, bundle_of, code_of
 from tests.commands import PYTHONPATH, ROOT
 from tests.commands import export_model as run
+from tests.exporting import export_model, load_policy
 
 SHARED = ROOT.parent / "shared"
 

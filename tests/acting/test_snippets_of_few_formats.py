@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from export_model.exporter import export_model
 from export_model.exporter.snippets.contract import class_name, identifier, read_bundle, wrap_items
 from export_model.exporter.snippets.registry import snippets
 from fixtures import path as fixture
 from tests.commands import export_model as run
 from tests.commands import is_refused
+from tests.exporting import export_model
 
 
 def test_what_a_bundle_has_not_is_left_out_or_refused(tmp_path: Path) -> None:

@@ -78,7 +78,7 @@ def main() -> int:
 
 def made(policy: str, peers: Peers, scratch: Path) -> tuple[Side, Side]:
     """Our files and theirs."""
-    from export_model.exporter import export_model
+    from tests.exporting import export_model
 
     source = ROOT / "fixtures" / f"{policy.replace('loops', 'recurrent')}.bytes"
     (bundle,) = export_model(source, scratch, verify="none")

@@ -19,13 +19,12 @@ from pathlib import Path
 
 import numpy as np
 
-from export_model.exporter import export_model
-from export_model.exporter.acting.loading import load_policy
 from export_model.exporter.play.options import PlayOptions
 from export_model.exporter.play.play import play_policy
 from export_model.exporter.tables import table
 from export_model.signatures.sampling import draw_typical
 from fixtures import trained
+from tests.exporting import export_model, load_policy
 
 EPISODES, STEPS, AGENTS = 200, 100_000, 500
 TARGET, LOG_TARGET = 20.0, 10.0

@@ -78,11 +78,11 @@ def test_nothing_is_fetched(site: Path, parsed: dict[Path, _Page]) -> None:
 
 
 def test_the_reference_is_whole(parsed: dict[Path, _Page]) -> None:
-    from export_model import exporter
+    import export_model
     from export_model.exporter.cli.app import app
 
     names = {name for page in parsed.values() for name in page.names}
-    for function in (n for n in exporter.__all__ if not n.startswith("_")):
+    for function in (n for n in export_model.__all__ if not n.startswith("_")):
         assert any(name.endswith(f".{function}") for name in names), function
     for command in app.commands:
         assert f"export-model-{command}" in names, command

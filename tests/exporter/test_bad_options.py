@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 from export_model.converters.files.chunks import Pieces
-from export_model.exporter import export_model as export_by_python
 from export_model.exporter.verify.options import VerifyOptions
 from export_model.exporter.verify.tolerances import Tolerance
 from export_model.signatures.errors import RefusedError, UsageError
 from fixtures import path as fixture
 from tests.commands import export_model, files_in, is_refused, python
+from tests.exporting import export_model as export_by_python
 from tests.handmade import continuous_policy, graph_bytes
 
 BALL = fixture("continuous")

@@ -13,14 +13,13 @@ import pytest
 
 from export_model.converters.runtimes.pool import RuntimePool
 from export_model.converters.runtimes.registry import available_runtimes
-from export_model.exporter.acting.loading import load_policy
-from export_model.exporter.api import verify_bundle
 from export_model.exporter.export.pipeline import ExportOptions, export
 from export_model.exporter.reports.summary import failure_lines
 from export_model.exporter.snippets.contract import example_shape, read_bundle
 from export_model.signatures.batches import batches_of, put_together, rows_of
 from export_model.signatures.errors import UsageError
 from fixtures import path
+from tests.exporting import load_policy, verify_bundle
 
 Array = npt.NDArray[Any]
 FIXED = ("onnxruntime", "litert")

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from export_model.converters.files.fetch import inside
-from export_model.exporter import load_policy
 from fixtures import path as fixture
 from tests.commands import export_model, is_refused
+from tests.exporting import load_policy
 from tests.fuzz.seeds import _seeds, files_of
 from tests.hostile.test_files_in_place_of_weights import external
 

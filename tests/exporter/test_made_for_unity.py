@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 
 from export_model.converters.consumers.profiles import profile
-from export_model.exporter import export_model, verify_bundle
 from export_model.exporter.verify.checks.consumer import consumers
 from export_model.exporter.verify.options import VerifyOptions
 from export_model.signatures.errors import UsageError
 from fixtures import path as fixture
+from tests.exporting import export_model, verify_bundle
 
 
 @pytest.mark.parametrize(

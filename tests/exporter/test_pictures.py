@@ -18,10 +18,10 @@ from export_model.converters.formats.frozen_graph.encode import as_read
 from export_model.converters.formats.frozen_graph.reader import read_graph
 from export_model.converters.formats.tensorboard import FILE_NAME, event_file
 from export_model.converters.graph.nodes import Graph, Node, TensorShape
-from export_model.exporter import export_model as export
 from export_model.exporter.export.sources import read_source
 from fixtures import path as fixture
 from tests.commands import ROOT, export_model, is_refused
+from tests.exporting import export_model as export
 
 SHARED = ROOT.parent / "shared"
 SVG = "{http://www.w3.org/2000/svg}"

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 import export_model as public
-from export_model import exporter
-from export_model.exporter import export_model, inspect_model, load_policy, verify_bundle
+from export_model.converters.files.children.process import RunFailedError
 from export_model.exporter.export.pipeline import ExportResult
 from export_model.exporter.inspect.inspection import Inspection
 from export_model.exporter.verify.options import VerifyOptions
 from export_model.exporter.verify.report import ParityReport
+from export_model.signatures import errors
 from export_model.signatures.errors import (
     BundleError,
     ExportModelError,
@@ -26,22 +26,24 @@ from export_model.signatures.errors import (
 from export_model.signatures.roles import Role
 from fixtures import path as fixture
 from tests.commands import export_model as command
-from tests.commands import files_in
+from tests.commands import files_in, python
 from tests.exporter.rehearsal import ALL, KNOWN, ActingPool, Tensors
+from tests.exporting import export_model, inspect_model, load_policy, verify_bundle
 
 BALL = fixture("continuous")
 
 
-def test_the_package_offers_its_functions_and_its_version() -> None:
-    functions = {"compare_artefacts", "export_model", "inspect_model", "load_policy", "verify_bundle"}
-    assert set(exporter.__all__) == {"__version__", *functions}
-    assert all(hasattr(exporter, name) for name in exporter.__all__)
-    assert set(exporter.__all__) <= set(dir(exporter))
+def test_every_error_is_a_name_of_the_package() -> None:
+    found = [c for c in vars(errors).values() if isinstance(c, type) and issubclass(c, Exception)] + [RunFailedError]
+    assert {kind.__name__ for kind in found} == {name for name in public.__all__ if name.endswith("Error")}
+    assert all(getattr(public, kind.__name__) is kind and kind.__module__ == "export_model" for kind in found)
+    said = python("-c", "import export_model; export_model.load('nothing.onnx')").err
+    assert "\nexport_model.SourceError: nothing.onnx: " in said
 
 
 def test_the_public_module_takes_options_in_groups(tmp_path: Path) -> None:
     """The same files as with flat keywords."""
-    assert set(dir(public)) == set(public.__all__) and len(dir(public)) <= 13
+    assert set(dir(public)) == set(public.__all__) and len(dir(public)) <= 30
     assert all(getattr(public, name) is not None for name in dir(public))
     read = public.ReadOptions(brain="StrikerBrain", inputs={"StrikerBrain/state": Role.VECTOR})
     write = public.WriteOptions(names="source", noise="zero", deterministic=True)

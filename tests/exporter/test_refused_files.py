@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from export_model.exporter import api
 from export_model.exporter.fleet.sources import sources_in
 from export_model.signatures.errors import RefusedError
 from fixtures import path as fixture
+from tests import exporting
 from tests.commands import export_model
 
 PLAIN = ("--to", "onnx", "--verify", "none")
@@ -43,7 +43,7 @@ def test_a_damaged_file_refuses_itself_and_not_its_folder(many: tuple[str, ...],
 
 def test_python_raises_when_the_rest_is_written(folder: Path) -> None:
     with pytest.raises(RefusedError) as caught:
-        api.export_model(folder, folder.parent / "out", to=["onnx"], verify="none")
+        exporting.export_model(folder, folder.parent / "out", to=["onnx"], verify="none")
     assert "cut.bytes" in str(caught.value)
     assert (folder.parent / "out/good/policy.json").is_file()
 
@@ -100,7 +100,7 @@ def test_what_else_a_pattern_matches_is_named(folder: Path) -> None:
 
 
 def test_what_tensorflow_puts_beside_a_model_is_no_source(tmp_path: Path) -> None:
-    made = api.export_model(fixture("continuous"), tmp_path / "made", to=["saved_model"], verify="none")
+    made = exporting.export_model(fixture("continuous"), tmp_path / "made", to=["saved_model"], verify="none")
     saved = made[0].folder / "saved_model"
     for name in ("fingerprint.pb", "keras_metadata.pb"):
         (saved / name).write_bytes(b"\x08\x01")
@@ -110,7 +110,7 @@ def test_what_tensorflow_puts_beside_a_model_is_no_source(tmp_path: Path) -> Non
 
 def test_a_changed_bundle_does_not_keep_the_others_from_being_verified(tmp_path: Path) -> None:
     for name in ("continuous", "discrete", "visual"):
-        api.export_model(fixture(name), tmp_path / "out", to=["bytes", "onnx"], verify="none")
+        exporting.export_model(fixture(name), tmp_path / "out", to=["bytes", "onnx"], verify="none")
     (tmp_path / "out/continuous/continuous.onnx").write_bytes(b"other")
     (tmp_path / "out/visual/parity.json").write_text("{}")
     (tmp_path / "out/visual/policy.json").unlink()

@@ -14,7 +14,6 @@ from export_model.converters.formats.registry import DEFAULTS, WRITTEN
 from export_model.converters.graph.nodes import Graph, Node, TensorShape
 from export_model.converters.graph.run import run_graph
 from export_model.converters.runtimes.pool import RuntimePool
-from export_model.exporter import export_model, verify_bundle
 from export_model.exporter.export.sources import read_source
 from export_model.exporter.reports.entry import of_result
 from export_model.exporter.reports.markdown import markdown_text
@@ -23,6 +22,7 @@ from export_model.exporter.tables import size_text
 from export_model.exporter.verify.checks import decisions as check
 from export_model.signatures.errors import UsageError
 from fixtures import path as fixture
+from tests.exporting import export_model, verify_bundle
 
 _KEPT: tuple[Storage, ...] = ("float16", "int8")
 

@@ -11,11 +11,11 @@ import pytest
 from export_model.converters.files import tensorflow_messages as schema
 from export_model.converters.graph.run import run_graph
 from export_model.converters.runtimes.pool import RuntimePool
-from export_model.exporter.api import export_model as exported
-from export_model.exporter.api import inspect_model, verify_bundle
 from export_model.signatures.errors import BundleError, UsageError
 from tests.checkpoint.writing import TrainingGraph, bundle, expected, policy
 from tests.commands import export_model, is_refused
+from tests.exporting import export_model as exported
+from tests.exporting import inspect_model, verify_bundle
 
 OBSERVATION = np.linspace(-1, 1, 12, dtype=np.float32).reshape(4, 3)
 STEPS = (10, 200, 30)

@@ -13,7 +13,6 @@ from export_model.converters.formats.registry import WRITTEN
 from export_model.converters.policy.policy import Policy
 from export_model.converters.runtimes.pool import RuntimePool
 from export_model.converters.runtimes.registry import available_runtimes
-from export_model.exporter.api import verify_bundle
 from export_model.exporter.export.pipeline import ExportOptions, export
 from export_model.exporter.export.sources import read_source
 from export_model.exporter.verify.checks.agents import agents
@@ -24,6 +23,7 @@ from export_model.exporter.verify.verification import verify
 from export_model.signatures.code import CodeOptions
 from export_model.signatures.contract import Contract, Origin
 from fixtures import FOLDER, path
+from tests.exporting import verify_bundle
 from tests.hostile.zoo_bundles import rehashed
 from tests.programs.test_programs import need
 

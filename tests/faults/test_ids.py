@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from export_model.converters.runtimes.pool import RuntimePool
-from export_model.exporter.acting.loading import load_policy
 from export_model.exporter.export.pipeline import ExportOptions, export
 from export_model.exporter.verify.participants import Feeds
 from export_model.signatures.errors import UsageError
+from tests.exporting import load_policy
 from tests.faults.test_blind_spots import Arrays, honest, verified
 from tests.handmade import constant, dense, graph_bytes, node, placeholder, weights
 

@@ -28,7 +28,6 @@ from export_model.converters.formats.keras.source import build_layered
 from export_model.converters.formats.keras.weights import Groups
 from export_model.converters.formats.read import ports_of
 from export_model.converters.formats.registry import WRITTEN
-from export_model.exporter import load_policy
 from export_model.exporter.export.pipeline import ExportOptions, export
 from export_model.exporter.inspect.inspection import inspect_source, inspection_text
 from export_model.exporter.snippets.contract import read_bundle
@@ -36,6 +35,7 @@ from export_model.exporter.snippets.registry import snippets
 from export_model.exporter.verify.golden import read_golden
 from export_model.signatures.errors import ExportModelError, SourceError, naming
 from export_model.signatures.spec import PolicySignature
+from tests.exporting import load_policy
 from tests.fuzz.seeds import READERS, Files, mutant
 
 #: What a mutant may take: seconds of computing, bytes above what the process had when it was ready.

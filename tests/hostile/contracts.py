@@ -24,7 +24,6 @@ from hypothesis import strategies as st
 
 from export_model.converters.files import tensorflow_messages as schema
 from export_model.converters.runtimes.pool import RuntimePool
-from export_model.exporter.acting.loading import load_policy
 from export_model.exporter.serve import site
 from export_model.signatures.contract import EMBEDDED
 from export_model.signatures.digest import sha256_hex
@@ -32,6 +31,7 @@ from export_model.signatures.errors import ExportModelError
 from export_model.signatures.roles import Role
 from fixtures import path as fixture
 from tests.commands import export_model
+from tests.exporting import load_policy
 
 POLICIES = ("continuous", "recurrent", "discrete", "visual", "sampled")
 #: Seconds of computing that a command may take.

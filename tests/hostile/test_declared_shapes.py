@@ -15,7 +15,7 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from export_model.converters.formats.registry import WRITTEN
-from export_model.exporter import export_model
+from tests.exporting import export_model
 
 #: What ``inspect``, which asks all writers, may take beside the modules that it imports: bytes, seconds of processor.
 MEMORY, SECONDS = 256 << 20, 10.0

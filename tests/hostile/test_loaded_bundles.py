@@ -13,10 +13,10 @@ from onnx import TensorProto, helper
 
 pytest.importorskip("onnxruntime")
 
-from export_model.exporter import load_policy
 from export_model.exporter.export.pipeline import ExportOptions, export
 from export_model.signatures.errors import ExportModelError
 from fixtures import path as fixture
+from tests.exporting import load_policy
 
 ESCAPE = "\x1b]0;owned\x07"
 

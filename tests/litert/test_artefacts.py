@@ -19,7 +19,6 @@ from export_model.converters.graph.nodes import Node
 from export_model.converters.graph.ops.table import TABLE
 from export_model.converters.runtimes.pool import RuntimePool
 from export_model.converters.runtimes.registry import available_runtimes
-from export_model.exporter.api import verify_bundle
 from export_model.exporter.export.pipeline import ExportOptions, ExportResult, export
 from export_model.exporter.export.sources import read_source
 from export_model.exporter.reports.summary import failure_lines
@@ -30,6 +29,7 @@ from fixtures import FIXTURES, path
 from tests import known
 from tests.comparing import compare_artefacts
 from tests.conftest import Chosen
+from tests.exporting import verify_bundle
 from tests.graph.harness import policy_of
 from tests.graph.making import const, graph, node, placeholder
 

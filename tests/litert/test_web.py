@@ -11,12 +11,12 @@ import pytest
 from export_model.converters.files.children.process import RunFailedError
 from export_model.converters.runtimes.pool import RuntimePool
 from export_model.converters.runtimes.registry import available_runtimes
-from export_model.exporter.api import verify_bundle
 from export_model.exporter.export.pipeline import ExportOptions, ExportResult, export
 from export_model.exporter.reports.summary import failure_lines
 from fixtures import FIXTURES, path
 from tests import known
 from tests.conftest import Chosen
+from tests.exporting import verify_bundle
 from tests.litert.sweep import WEB, agents
 from tests.onnx_reader.models import floats, model, node, save
 

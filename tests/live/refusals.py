@@ -11,8 +11,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from export_model.exporter import export_model
 from export_model.signatures.errors import ExportModelError
+from tests.exporting import export_model
 from tests.live.train import Policy, dense, draw, tf, v1  # first: it sets up TensorFlow
 
 

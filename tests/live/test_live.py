@@ -12,10 +12,10 @@ import pytest
 
 from export_model.converters.policy.policy import Policy
 from export_model.converters.runtimes.pool import RuntimePool
-from export_model.exporter import export_model
 from export_model.exporter.export.sources import read_source
 from export_model.signatures.errors import UsageError
 from tests.commands import files_in, python
+from tests.exporting import export_model
 from tests.live.conftest import Trained
 
 pytestmark = pytest.mark.xdist_group("live")

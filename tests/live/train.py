@@ -22,8 +22,8 @@ os.environ.update(TF_CPP_MIN_LOG_LEVEL="3", TF_ENABLE_ONEDNN_OPTS="0", CUDA_VISI
 
 import tensorflow as tf
 
-from export_model.exporter import export_model
 from export_model.signatures.digest import sha256_hex
+from tests.exporting import export_model
 from tests.live.programs import shared_runtimes
 
 RANDOM = np.random.default_rng(11)

@@ -16,11 +16,11 @@ import pytest
 from onnx import helper, numpy_helper
 
 from export_model.converters.trainers.stable_baselines3.normaliser import read_normaliser
-from export_model.exporter.acting.loading import load_policy
 from export_model.signatures.contract import POLICY
 from fixtures import trained
 from fixtures.sb3_zip import NORMALISED
 from tests.commands import export_model
+from tests.exporting import load_policy
 from tests.interfaces.made import write_onnx
 from tests.logs.planting import Array, Fault, recorded
 from tests.stable_baselines3.saved_models import saved

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from export_model.exporter.acting.loading import load_policy
 from export_model.exporter.acting.policy import LoadedPolicy
 from export_model.exporter.logs.check import LogReport, check_log
 from export_model.signatures.roles import Role
 from tests.commands import ROOT
+from tests.exporting import load_policy
 from tests.logs.planting import Array, Arrays, Fault, recorded
 
 FIXTURES = ROOT / "fixtures"

@@ -14,12 +14,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from jsonschema import Draft202012Validator
 
-from export_model.exporter.acting.loading import load_policy
 from export_model.exporter.acting.policy import LoadedPolicy
 from export_model.exporter.logs.reading import read_recording
 from export_model.exporter.logs.recording import NONE, links
 from export_model.signatures.errors import UsageError
 from tests.commands import ROOT, export_model, is_refused
+from tests.exporting import load_policy
 from tests.logs.planting import Arrays
 from tests.reports.validation import closed, schema
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from export_model.exporter.acting.loading import load_policy
 from export_model.exporter.logs.recording import NONE
 from export_model.exporter.logs.replay import SHORT, MemoryUse, Replay
 from tests.commands import ROOT
+from tests.exporting import load_policy
 
 HALLWAY = ROOT / "fixtures" / "trained" / "Hallway"
 STEPS = 3 * SHORT * SHORT // 64

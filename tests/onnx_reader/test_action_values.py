@@ -14,12 +14,12 @@ import pytest
 from export_model.converters.compiler.options import CompileOptions
 from export_model.converters.policy.action_values import EVIDENCE
 from export_model.converters.policy.policy import Policy
-from export_model.exporter import load_policy
 from export_model.exporter.export.pipeline import ExportOptions, export
 from export_model.exporter.export.sources import read_source
 from export_model.exporter.reports.summary import failure_lines
 from export_model.signatures.errors import ExportModelError, NotAPolicyError, SignatureError, UsageError
 from export_model.signatures.roles import Role
+from tests.exporting import load_policy
 from tests.onnx_reader.models import Bench, floats, model, node, save
 
 pytestmark = pytest.mark.xdist_group("onnx-policies")

@@ -12,10 +12,10 @@ from onnx import TensorProto, helper, numpy_helper
 from export_model.converters.graph.run import run_graph
 from export_model.converters.policy.memories import looks_like_state, stem_of
 from export_model.converters.policy.policy import Policy
-from export_model.exporter import export_model, load_policy
 from export_model.exporter.export.sources import read_source
 from export_model.signatures.errors import SignatureError
 from export_model.signatures.roles import Role
+from tests.exporting import export_model, load_policy
 
 WEIGHTS = np.random.default_rng(0).normal(size=(3, 3)).astype(np.float32)
 

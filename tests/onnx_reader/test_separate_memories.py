@@ -21,7 +21,6 @@ from export_model.converters.formats.onnx.memories import FoundMemories, separat
 from export_model.converters.graph.run import run_graph
 from export_model.converters.policy.policy import Policy
 from export_model.converters.runtimes.pool import RuntimePool
-from export_model.exporter.api import verify_bundle
 from export_model.exporter.export.pipeline import ExportOptions, ExportResult, export
 from export_model.exporter.export.sources import read_source
 from export_model.exporter.reports.summary import failure_lines
@@ -31,6 +30,7 @@ from export_model.signatures.errors import SignatureError
 from export_model.signatures.memories import SourcePart, join_memory, split_memory
 from export_model.signatures.roles import Role
 from export_model.signatures.spec import Memory
+from tests.exporting import verify_bundle
 from tests.onnx_reader.models import Array, Bench, floats, model, node, save
 
 pytestmark = pytest.mark.xdist_group("onnx-policies")

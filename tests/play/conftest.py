@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 
 from export_model.converters.runtimes.pool import RuntimePool
-from export_model.exporter import export_model
 from export_model.exporter.play.play import play_policy
 from export_model.exporter.play.report import PlayReport
 from fixtures import trained
+from tests.exporting import export_model
 from tests.reports.validation import check_play
 
 #: Few, where what is tried is found whatever the number.

@@ -24,8 +24,6 @@ from typing import Any
 import numpy as np
 from msgspec import Struct
 
-from export_model.exporter import export_model
-from export_model.exporter.acting.loading import load_policy
 from export_model.exporter.play.episodes import Episodes, play_episodes
 from export_model.exporter.play.equivalence import Equivalence
 from export_model.exporter.play.match import decide, seed_of
@@ -33,6 +31,7 @@ from export_model.exporter.play.named import world_maker
 from export_model.exporter.play.options import PlayOptions
 from export_model.exporter.verify.plays import DIFFERENT, NOT_DECIDED
 from fixtures import gym, trained
+from tests.exporting import export_model, load_policy
 
 Array = np.ndarray
 OURS = ("3DBall", "GridWorld", "Hallway", "Tennis-LeftBrain", "Tennis-RightBrain", "Crawler2D")

@@ -185,7 +185,7 @@ class Told:
 
 
 def signature_of(name: str) -> Any:
-    from export_model.exporter import inspect_model
+    from tests.exporting import inspect_model
 
     return inspect_model(fixture(name)).policies[0].policy.signature
 
@@ -253,7 +253,7 @@ def test_a_number_is_a_vector_with_a_1_and_a_box_is_clipped() -> None:
 
 
 def test_choices_begin_where_the_space_says() -> None:
-    from export_model.exporter import inspect_model
+    from tests.exporting import inspect_model
 
     signature = inspect_model(gym.path("CartPole-v1")).policies[0].policy.signature
     told = Told(np.zeros(4), {}, Space(n=2, start=5))

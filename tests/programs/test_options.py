@@ -21,13 +21,13 @@ from export_model.converters.runtimes.c import compiler
 from export_model.converters.runtimes.csharp import tools
 from export_model.converters.runtimes.javascript.node import node_executable
 from export_model.converters.runtimes.pool import RuntimePool
-from export_model.exporter.api import verify_bundle
 from export_model.exporter.export.pipeline import Exporter, ExportOptions, export
 from export_model.exporter.export.sources import read_source
 from export_model.exporter.reports.summary import failure_lines
 from export_model.signatures.code import CodeOptions, code_options
 from export_model.signatures.errors import DamagedFileError, UsageError
 from fixtures import path
+from tests.exporting import verify_bundle
 from tests.programs.mains import MAINS
 from tests.programs.test_programs import PROGRAMS, need
 

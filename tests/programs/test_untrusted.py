@@ -11,10 +11,10 @@ from export_model.converters.files.children.process import RunFailedError
 from export_model.converters.formats.format import Format
 from export_model.converters.formats.programs import artifact
 from export_model.converters.runtimes.pool import RuntimePool
-from export_model.exporter.api import verify_bundle
 from export_model.exporter.export.pipeline import ExportOptions, export
 from export_model.signatures.errors import UnsupportedOpError
 from fixtures import path
+from tests.exporting import verify_bundle
 from tests.programs.test_programs import PROGRAMS, need
 
 pytestmark = [

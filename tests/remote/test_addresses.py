@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 
 from export_model.converters.files import fetch
-from export_model.exporter import export_model, inspect_model, verify_bundle
 from export_model.exporter.export.pipeline import ExportOptions
 from export_model.exporter.fleet.fleet import export_fleet
 from export_model.exporter.fleet.sources import sources_in
@@ -23,6 +22,7 @@ from export_model.signatures.contract import POLICY
 from export_model.signatures.errors import BundleError, SourceError, UsageError
 from fixtures import path as fixture
 from tests.comparing import compare_artefacts
+from tests.exporting import export_model, inspect_model, verify_bundle
 
 fsspec = pytest.importorskip("fsspec")
 

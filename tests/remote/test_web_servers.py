@@ -21,13 +21,13 @@ import pytest
 
 from export_model.converters.files import fetch
 from export_model.converters.files.fetch import address_of
-from export_model.exporter import export_model
 from export_model.exporter.remote import filesystem, redirects
 from export_model.exporter.remote.fetching import nearby
 from export_model.exporter.remote.filesystem import Pace, asking, matching
 from export_model.signatures.errors import SourceError, UsageError
 from fixtures import path as fixture
 from tests.commands import export_model as command
+from tests.exporting import export_model
 from tests.remote.test_addresses import files, run
 
 fsspec = pytest.importorskip("fsspec")

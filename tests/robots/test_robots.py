@@ -24,13 +24,13 @@ import export_model as public
 from export_model.converters.consumers.profiles import PROFILES, profile
 from export_model.converters.consumers.robots.interface import FileInterface, FileTensor, interface_of
 from export_model.converters.consumers.robots.loaders import LOADERS
-from export_model.exporter import export_model, load_policy, verify_bundle
 from export_model.exporter.verify.checks.consumer import consumers
 from export_model.signatures.contract import parse_signature
 from export_model.signatures.errors import ProfileError, UsageError
 from fixtures import path as fixture
 from tests.commands import export_model as command
 from tests.commands import is_refused
+from tests.exporting import export_model, load_policy, verify_bundle
 from tests.known import ABSENT, SHARED
 
 pytestmark = pytest.mark.xdist_group("robots")

@@ -18,11 +18,11 @@ from export_model.converters.files import tensorflow_messages as schema
 from export_model.converters.files.fetch import neighbours
 from export_model.converters.formats.recognise import recognise
 from export_model.converters.graph.nodes import TensorShape
-from export_model.exporter import inspect_model
 from export_model.signatures.errors import SourceError
 from fixtures import FIXTURES
 from fixtures import path as fixture
 from tests.commands import export_model, files_in, is_refused
+from tests.exporting import inspect_model
 from tests.handmade import continuous_policy, graph_bytes, node
 
 

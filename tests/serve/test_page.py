@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from export_model.exporter.acting.loading import load_policy
 from export_model.exporter.serve.site import assemble, assemble_one_file, write_site
 from fixtures.trained import run_folder
 from tests.commands import export_model
+from tests.exporting import load_policy
 from tests.serve.browsing import CHECKED, Visit, served, visit, with_backends
 from tests.serve.conftest import Bundle
 

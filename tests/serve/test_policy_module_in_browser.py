@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from export_model.exporter.acting.loading import load_policy
 from export_model.exporter.serve.site import assemble
 from fixtures import path as fixture
 from tests.acting.test_load_policy import observed
+from tests.exporting import load_policy
 from tests.serve.browsing import CHECKED, served, visit, with_backends
 from tests.serve.conftest import Bundle
 

@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 
 from export_model.converters.runtimes.javascript import node as javascript
-from export_model.exporter.acting.loading import load_policy
 from export_model.exporter.serve import site as site_of_bundles
 from export_model.exporter.serve.onefile import one_file
 from export_model.exporter.serve.scenes import other_side
@@ -24,6 +23,7 @@ from export_model.exporter.serve.site import PAGE, assemble, assemble_one_file, 
 from export_model.signatures.errors import BundleError, UnsupportedOpError, UsageError
 from fixtures import path as fixture
 from tests.commands import export_model, files_in, is_refused
+from tests.exporting import load_policy
 from tests.serve.conftest import Bundle
 
 OWN = [p for p in sorted(PAGE.rglob("*")) if p.is_file()]

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from export_model.exporter import export_model, load_policy
 from export_model.exporter.export.pipeline import ExportResult
 from export_model.signatures.errors import UsageError
 from tests import commands
+from tests.exporting import export_model, load_policy
 
 pytest.importorskip("onnxruntime")
 FIXTURES = Path(__file__).resolve().parents[2] / "fixtures"

@@ -21,11 +21,11 @@ from export_model.converters.graph.run import run_graph
 from export_model.converters.graph.shapes import infer_types
 from export_model.converters.graph.types import BATCH
 from export_model.converters.policy.policy import Policy
-from export_model.exporter import export_model, load_policy
 from export_model.exporter.verify.checks.consumer import consumers
 from export_model.signatures.contract import EMBEDDED
 from export_model.signatures.errors import ProfileError, UsageError
 from tests import commands, known
+from tests.exporting import export_model, load_policy
 from tests.handmade import NodeDef, constant, dense, graph_bytes, node, placeholder, sampled_policy
 from tests.targets.dressed import Pair, Plain, compiled, runner_of
 

@@ -14,13 +14,13 @@ from export_model.converters.files.fetch import Fetched
 from export_model.converters.formats.bundle.bundle import Bundle
 from export_model.converters.formats.recognise import recognise_path
 from export_model.converters.formats.source import ReadOptions
-from export_model.exporter import inspect_model
 from export_model.exporter.export.sources import read_source
 from export_model.signatures.errors import DamagedFileError, NotAPolicyError, SourceError, UsageError
 from export_model.signatures.roles import Role
 from fixtures.torch_checkpoint import FOLDER
 from fixtures.torch_checkpoint.cases import CASES, waves
 from tests.commands import export_model
+from tests.exporting import inspect_model
 from tests.torch_checkpoint.pt_files import Writer, actor, checkpoint, weights, zipped
 
 SAID = {c.name: c for c in CASES if not c.stored}

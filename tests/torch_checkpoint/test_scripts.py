@@ -13,12 +13,12 @@ from export_model.converters.formats.source import ReadOptions
 from export_model.converters.graph.run import run_graph
 from export_model.converters.trainers.scripts.choice import known_state
 from export_model.converters.trainers.scripts.table import SCRIPTS
-from export_model.exporter import inspect_model
 from export_model.exporter.export.sources import read_source
 from export_model.signatures.errors import SourceError, UsageError
 from fixtures.state_dicts import FOLDER
 from fixtures.torch_checkpoint.cases import waves
 from tests.commands import export_model
+from tests.exporting import inspect_model
 from tests.torch_checkpoint.pt_files import Writer
 from tests.torch_checkpoint.test_state_dicts import saved, trunk_of_ones_own
 

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from export_model.converters.runtimes.pool import RuntimePool
-from export_model.exporter import export_model
 from export_model.exporter.play.environments import ENVIRONMENTS
 from export_model.exporter.play.environments.tennis import BRAINS
 from fixtures import trained
 from fixtures.evaluate import Contract, Decide, Player, Score, play, together
 from fixtures.trained.scores import EPISODES, SEED
+from tests.exporting import export_model
 
 Array = np.ndarray[Any, Any]
 Run = Callable[[Mapping[str, Array], Sequence[str]], Mapping[str, Array]]

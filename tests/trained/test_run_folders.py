@@ -12,7 +12,7 @@ import pytest
 
 from export_model.converters.formats.frozen_graph.reader import read_graph
 from export_model.converters.runtimes.pool import RuntimePool
-from export_model.exporter import demo, export_model, inspect_model
+from export_model.exporter import demo
 from export_model.exporter.play.environments import ENVIRONMENTS
 from fixtures import FOLDER as FIXTURES
 from fixtures import trained
@@ -21,6 +21,7 @@ from fixtures.goldens import read_npz
 from fixtures.trained import DEMONSTRATED, FOLDER, TRAINED, run_folder, weights_file
 from fixtures.trained.scores import README, decide, in_readme
 from tests.commands import ROOT
+from tests.exporting import export_model, inspect_model
 from tests.trained.conftest import Stage
 
 REPORT = trained.report()

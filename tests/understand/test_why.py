@@ -19,11 +19,11 @@ from export_model.converters.policy.brains import _ACTIONS, _DECLARED_ACTIONS, e
 from export_model.converters.policy.input_rules import BY_NAME, BY_READERS, LAST_RESORTS
 from export_model.converters.policy.inputs import classify_inputs, explain_inputs
 from export_model.converters.policy.rules import RoleDecision
-from export_model.exporter import inspect_model
 from export_model.exporter.export.sources import read_source
 from export_model.signatures.errors import ExportModelError, SignatureError
 from export_model.signatures.roles import Role
 from tests import commands, known
+from tests.exporting import inspect_model
 from tests.signatures.nodes import FLOAT, INT, Dims, constant, graph, op, placeholder
 
 UINT8 = np.dtype(np.uint8)

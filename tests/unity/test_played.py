@@ -23,11 +23,11 @@ from export_model.converters.consumers.unity.settings import Brain
 from export_model.converters.formats.barracuda.format import NnModel, parse
 from export_model.converters.formats.source import ReadOptions
 from export_model.converters.graph.ops.barracuda.vocabulary import LayerType
-from export_model.exporter import export_model
 from export_model.exporter.export.sources import read_source
 from export_model.signatures.errors import ProfileError, SignatureError, UnsupportedOpError
 from tests.barracuda.accepted import agent_of
 from tests.barracuda.test_writer import assert_answers
+from tests.exporting import export_model
 from tests.known import ABSENT, SHARED
 from tests.targets.dressed import Pair, Plain
 from tests.targets.sweep import SENSORS

@@ -20,8 +20,8 @@ from export_model.converters.consumers.unity.checker import UnityVerdict, check_
 from export_model.converters.consumers.unity.consumers import CONSUMERS
 from export_model.converters.consumers.unity.onnx_file import OnnxFile
 from export_model.converters.consumers.unity.settings import Brain, Sensor
-from export_model.exporter import export_model
 from export_model.signatures.errors import ProfileError
+from tests.exporting import export_model
 from tests.unity.conftest import ABSENT, UNITY, lines
 
 #: A ``.pt`` alone does not say which columns are whose sensor: ``--sensors`` has tests of its own.

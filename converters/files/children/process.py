@@ -53,6 +53,7 @@ _REQUEST = 4 << 20
 class RunFailedError(ExportModelError):
     """A runtime refused a model or failed while running it. This is what verification reports, not a crash of it."""
 
+    __module__ = "export_model"
     exit_status = 1
     #: The words of a program that anyone may have made, for who asks for them: no message repeats them.
     said = ""

@@ -11,7 +11,7 @@
  *     const alone = await loadPolicy("policy.json", { code: await import("./3DBall.mjs") });      // --to js
  *
  * It imports nothing: the runtime is the page's own. Draws are made here, from log-probabilities and with normal noise,
- * by the generator that `exporter.load_policy` has in Python: one seed, the same actions everywhere. Types are in
+ * by the generator that `export_model.load` has in Python: one seed, the same actions everywhere. Types are in
  * policy.d.mts.
  */
 
