@@ -14,6 +14,7 @@ _COMMANDS = (
     "demo",
     "export",
     "inspect",
+    "layout",
     "play",
     "runtimes",
     "serve",

@@ -24,7 +24,7 @@ PROGRAM = "export-model"
 PATH, FILE = click.Path(path_type=Path), click.Path(path_type=Path, dir_okay=False)
 _OWN = frozenset(("--help", "-h", "--help-all", "--version"))
 #: Commands that ``--help`` leaves to ``--help-all``.
-_RARE = frozenset(("card", "completion", "consumers", "skill"))
+_RARE = frozenset(("card", "completion", "consumers", "layout", "skill"))
 
 
 #: Title of a group of options → their parameters, in the order of the help.
@@ -42,13 +42,14 @@ GROUPS = {
             "outputs_of",
             "guard",
             "scene",
+            "write",
             "target",
             "files",
         ),
     ),
     "How to read the source": (
         *("source", "step", "brain", "inputs", "outputs", "values", "mapped", "sensors", "activation", "script"),
-        *("repair", "normaliser", "interface", "trust_source"),
+        *("repair", "normaliser", "interface", "trust_source", "robot", "check"),
     ),
     "How to read the candidates": tuple(
         f"candidate_{name}"

@@ -150,6 +150,7 @@ def circles(imports: Mapping[str, set[str]]) -> dict[str, set[str]]:
 ROOMS_FROM_BELOW = (
     "files",
     "interfaces",
+    "layouts",
     "graph",
     "policy",
     "compiler",

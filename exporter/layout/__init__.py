@@ -1,0 +1,1 @@
+"""Which number is which: a policy's layout, told from its weights as far as a mirror tells it."""
