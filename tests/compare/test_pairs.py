@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +18,9 @@ from export_model.converters.formats.barracuda.writer import encode
 from export_model.converters.runtimes.pool import RuntimePool
 from export_model.exporter.export.pipeline import ExportOptions, export
 from export_model.exporter.verify.report import ParityReport
+from tests.commands import export_model
 from tests.comparing import compare_artefacts
+from tests.reports.validation import check_parity
 
 ROOT = Path(__file__).resolve().parents[2] / "fixtures"
 TORCH = ROOT / "torch_checkpoint"
@@ -143,3 +146,16 @@ def test_a_file_with_a_seed_agrees_with_itself(seed: float, tmp_path: Path, pool
 @pytest.mark.parametrize("name", sorted(LOST_MEMORY))
 def test_a_file_that_lost_its_memory_agrees_with_itself(name: str, pool: RuntimePool) -> None:
     assert compared(TORCH / f"{name}.onnx", TORCH / f"{name}.onnx", pool).passed is True
+
+
+@pytest.mark.parametrize("right", [True, False])
+def test_what_json_says_of_a_pair_fits_the_schema(right: bool, tmp_path: Path) -> None:
+    wrong = changed("ppo_1_1", tmp_path / "theirs.onnx", lambda w: np.ascontiguousarray(w[:, ::-1]))
+    candidate = TORCH / "ppo_1_1.onnx" if right else wrong
+    ran = export_model("compare", TORCH / "ppo_1_1.pt", candidate, "--verify", "onnxruntime", "--json")
+    assert ran.status == (not right)
+    printed = json.loads(ran.out)
+    assert list(printed) == ["reports"]
+    (report,) = printed["reports"]
+    check_parity(json.dumps(report))
+    assert report["verdict"] == ("passed" if right else "failed")
