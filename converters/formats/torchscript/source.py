@@ -109,7 +109,7 @@ def _inputs(forward: ast.FunctionDef) -> list[str]:
     parameters = forward.args.args[1:]
     needed = parameters[: len(parameters) - len(forward.args.defaults)]
     for parameter in needed:
-        if not isinstance(parameter.annotation, ast.Name) or parameter.annotation.id != "ScriptTensor":
+        if not isinstance(parameter.annotation, ast.Name) or parameter.annotation.id != "Tensor":
             raise SourceError(
                 f"its input {parameter.arg[:60]} is not a tensor",
                 why="a policy is fed tensors",
