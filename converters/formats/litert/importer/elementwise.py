@@ -10,23 +10,16 @@ from export_model.converters.formats.litert.schema import ACTIVATIONS
 from export_model.converters.graph.builder import Builder
 from export_model.converters.graph.nn import activations as nn
 from export_model.converters.graph.nn.normalisation import unit_length
+from export_model.converters.graph.ops.litert.base import Operator
+from export_model.converters.graph.ops.table import TABLE
 
-#: Operators that take what the op takes, and mean the same.
+#: Operators that take what the op takes, and mean the same: those that its entry is written as, and those that it is
+#: written without.
 _SAME = {
-    **{op.upper(): op for op in ("Abs", "Ceil", "Cos", "Elu", "Equal", "Exp", "Floor", "Greater", "Less", "Log")},
-    **{op.upper(): op for op in ("Maximum", "Minimum", "Neg", "Pow", "Relu", "Relu6", "Round", "Rsqrt", "Sign", "Sin")},
-    **{op.upper(): op for op in ("Sqrt", "Square", "Tanh")},
+    **{e.litert.op: op for op, e in TABLE.items() if isinstance(e.litert, Operator) and not e.litert.options},
     "ADD_N": "AddN",
     "FLOOR_DIV": "FloorDiv",
-    "FLOOR_MOD": "FloorMod",
-    "GREATER_EQUAL": "GreaterEqual",
-    "LESS_EQUAL": "LessEqual",
-    "LOGICAL_AND": "LogicalAnd",
-    "LOGICAL_NOT": "LogicalNot",
-    "LOGICAL_OR": "LogicalOr",
-    "LOGISTIC": "Sigmoid",
-    "LOG_SOFTMAX": "LogSoftmax",
-    "NOT_EQUAL": "NotEqual",
+    "SQUARE": "Square",
     "SQUARED_DIFFERENCE": "SquaredDifference",
     "ZEROS_LIKE": "ZerosLike",
 }

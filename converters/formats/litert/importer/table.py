@@ -7,4 +7,4 @@ from collections.abc import Mapping
 from export_model.converters.formats.litert.importer import arrays, elementwise, layers
 from export_model.converters.formats.litert.importer.operator import Translate
 
-TABLE: Mapping[str, Translate] = {**arrays.OPS, **elementwise.OPS, **layers.OPS}
+TABLE: Mapping[str, Translate] = {**elementwise.OPS, **arrays.OPS, **layers.OPS}
