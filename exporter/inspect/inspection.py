@@ -20,13 +20,12 @@ from export_model.converters.interfaces.text import kept_text, loop_lines, table
 from export_model.converters.policy.policy import Policy
 from export_model.converters.policy.rules import RoleDecision
 from export_model.exporter.export.sources import read_source
+from export_model.exporter.meanings import OUTPUT_MEANINGS, feed_text
 from export_model.exporter.reports.layers import blocks_of, chain
 from export_model.exporter.tables import count_text, paragraph, size_text, table
 from export_model.signatures.contract import safe_name
 from export_model.signatures.errors import ExportModelError, naming
 from export_model.signatures.fields import printable
-from export_model.signatures.ids import bounds_text
-from export_model.signatures.roles import Role
 from export_model.signatures.spec import PolicySignature, TensorSpec
 
 if TYPE_CHECKING:
@@ -34,28 +33,6 @@ if TYPE_CHECKING:
 if not TYPE_CHECKING:  # what asks a record for its signature looks these names up
     Fit = Any
 
-_FEED = {
-    Role.VECTOR: "the agent's vector observation, as the environment gives it{normalised}",
-    Role.VISUAL: "camera image, {layout}, colours {colours}, first row at the top",
-    Role.ENTITIES: "variable-length observation",
-    Role.NOISE: "N(0, 1) draws, or zeros for the deterministic action",
-    Role.MASKS: "1 = allowed, 0 = forbidden; branches side by side",
-    Role.PREV_ACTION: "the action of the step before, an integer per branch",
-    Role.MEMORY_IN: "recurrent_out of the step before; zeros at the start of an episode",
-    Role.PARAMETER: "not known to ML-Agents; feed it, or fix it with --set NAME=VALUE",
-}
-_MEANING = {
-    Role.CONTINUOUS: "continuous action",
-    Role.SAMPLED: "action drawn inside the graph, an integer per branch",
-    Role.LOG_PROBS: "log-probabilities per branch; draw from them, or take the argmax",
-    Role.PROBS: "probabilities per branch",
-    Role.DETERMINISTIC: "deterministic action",
-    Role.ACTION_PROBS: "the trainer's action_probs (its meaning changed from version to version)",
-    Role.VALUE: "the critic's value",
-    Role.Q_VALUES: "a value of each action (the action is the largest)",
-    Role.MEMORY_OUT: "memory for the next step",
-    Role.OTHER: "another output",
-}
 #: More nodes than this are no chain of layers that anybody would read.
 _MOST_NODES = 600
 #: Numbers of an observation whose statistics are shown.
@@ -286,8 +263,8 @@ def _reason_lines(decisions: Sequence[RoleDecision]) -> list[str]:
 
 def port_tables(signature: PolicySignature) -> list[tuple[tuple[str, ...], list[list[str]]]]:
     """Inputs with what to feed, and outputs with what they mean: head and rows of each."""
-    fed = [_row(s, _feed(s, signature.preprocess.get(s.name, {}))) for s in signature.inputs]
-    meant = [_row(s, _MEANING.get(s.role, s.role.value)) for s in signature.outputs]
+    fed = [_row(s, feed_text(s, signature)) for s in signature.inputs]
+    meant = [_row(s, OUTPUT_MEANINGS.get(s.role, s.role.value)) for s in signature.outputs]
     middle = ("dtype", "shape", "in the source")
     return [(("input", *middle, "what to feed"), fed), (("output", *middle, "meaning"), meant)]
 
@@ -323,21 +300,6 @@ def _interface_lines(signature: PolicySignature) -> list[str]:
     stated = [paragraph(text, "stated: ", "  ") for text in loop_lines(signature.interface)]
     kept = kept_text(signature.interface)
     return [*lines, *([""] if stated else []), *stated, *([paragraph(kept, "kept as text: ", "  ")] if kept else [])]
-
-
-def _feed(spec: TensorSpec, preprocess: Mapping[str, Any]) -> str:
-    known = spec.distribution or {}
-    if spec.role is Role.VECTOR and known.get("kind") == "integer":
-        return f"{'a history or a board' if len(spec.shape) > 2 else 'the discrete state'}, {bounds_text(spec)}"
-    if spec.role is Role.VECTOR and len(spec.shape) > 2:
-        return "numbers along several axes (a history, a board), as the environment gives them"
-    own = preprocess.get("range") == [0, 255]
-    colours = "from 0 to 255 (bytes as they are)" if own else "from 0 to 1 (divide bytes by 255)"
-    return _FEED.get(spec.role, spec.role.value).format(
-        layout=preprocess.get("layout", "NHWC"),
-        colours=colours,
-        normalised=" (normalised inside the policy)" if "std" in (spec.distribution or {}) else "",
-    )
 
 
 def _row(spec: TensorSpec, text: str) -> list[str]:

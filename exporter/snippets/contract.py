@@ -18,23 +18,14 @@ from export_model.converters.formats.bundle import bundle
 from export_model.converters.formats.frozen_graph.reader import read_graph
 from export_model.converters.formats.registry import FROZEN_GRAPH
 from export_model.converters.interfaces.text import ALL, loop_lines, term_lines
+from export_model.exporter.meanings import feed_text
 from export_model.signatures.contract import Contract
 from export_model.signatures.errors import naming
-from export_model.signatures.ids import bounds_text
 from export_model.signatures.roles import Role
 from export_model.signatures.spec import PolicySignature, TensorSpec
 
 #: The frames: a file each, under its own language's name, in the form of Python's string.Template.
 _FRAMES = Path(__file__).resolve().parent / "templates"
-_FEED = {
-    Role.VECTOR: "vector observation",
-    Role.ENTITIES: "variable-length observation",
-    Role.NOISE: "N(0, 1) draws; zeros: the deterministic action",
-    Role.MASKS: "1 allows an action, 0 forbids it; branches side by side",
-    Role.PREV_ACTION: "the actions of the step before",
-    Role.MEMORY_IN: "the memory of the step before; zeros at the start of an episode",
-    Role.PARAMETER: "the source's own placeholder: give it its value",
-}
 #: Roles of actions that are odds: classes are drawn by them.
 ODDS = (Role.LOG_PROBS, Role.PROBS)
 #: How many steps a snippet plays where the policy remembers.
@@ -173,18 +164,11 @@ def example_size(spec: TensorSpec) -> int:
 def meaning(bundle: SnippetBundle, spec: TensorSpec) -> list[str]:
     """Comment lines on an input: what it takes, and what its numbers are called."""
     signature = bundle.signature
-    text = _FEED.get(spec.role, spec.role.value)
-    if spec.role is Role.VISUAL:
-        how = signature.preprocess.get(spec.name, {})
-        colours = f"{' to '.join(map(str, how.get('range', [0, 1])))}"
-        text = f"camera image, {how.get('layout', 'NHWC')}, colours {colours}, first row at the top"
-    known = spec.distribution or {}
-    if spec.role is Role.VECTOR and known.get("kind") == "integer":
-        text = f"{'history or board' if len(spec.shape) > 2 else 'discrete state'}, {bounds_text(spec)}"
-    elif spec.role is Role.VECTOR and len(spec.shape) > 2:
-        text = "numbers along several axes (a history, a board)"
     names = signature.labels.get("observations", {}).get(spec.name, [])
-    return [*wrap_items(f"{spec.name}: {text}", number_names(names)), *_interface_lines(signature, spec.name)]
+    return [
+        *wrap_items(f"{spec.name}: {feed_text(spec, signature)}", number_names(names)),
+        *_interface_lines(signature, spec.name),
+    ]
 
 
 def action_meaning(bundle: SnippetBundle, head: TensorSpec) -> list[str]:
