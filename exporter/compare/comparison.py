@@ -34,6 +34,7 @@ from export_model.exporter.compare.weights import compare_rounded, merge_reports
 from export_model.exporter.export.sources import read_source
 from export_model.exporter.remote.fetching import nearby
 from export_model.exporter.verify.checks.size import check_budget
+from export_model.exporter.verify.checks.stated import check_own
 from export_model.exporter.verify.difference import compare
 from export_model.exporter.verify.findings import Finding, stated_finding
 from export_model.exporter.verify.options import VerifyOptions
@@ -130,6 +131,8 @@ def compare_artefacts(
 
 def _interface_findings(policy: Policy, candidate: AnyCandidate) -> Iterator[Finding]:
     """A finding for each figure or name that a candidate states otherwise than the reference."""
+    if candidate.path.is_file():
+        yield from check_own(candidate.label, candidate.forms[0], candidate.path)
     ours, theirs = policy.signature.interface, candidate.interface
     if ours is not None and theirs is not None:
         for text in interface_differences(ours, theirs, candidate.input_names):

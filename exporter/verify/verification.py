@@ -18,6 +18,7 @@ from export_model.exporter.verify.checks.finite import check_defined
 from export_model.exporter.verify.checks.numbers import check_recording, numbers
 from export_model.exporter.verify.checks.rollout import rollout
 from export_model.exporter.verify.checks.size import check_budget, sizes
+from export_model.exporter.verify.checks.stated import check_stated
 from export_model.exporter.verify.findings import Finding, failure, undecided_finding, undecided_reference
 from export_model.exporter.verify.participants import (
     Failure,
@@ -66,6 +67,7 @@ def verify(
             reference = answering.name
             findings += _findings(trial, answering, session, participants, inputs, checks)
         notes = trial.notes()
+    findings += check_stated(tested.files, tested.signature)
     findings += consumers(tested.profile, tested.files, memory=tested.signature.memory is not None)
     return _report(trial, reference, session, in_order(findings, tested), notes)
 

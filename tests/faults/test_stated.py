@@ -1,0 +1,25 @@
+"""What a file states of its numbers beside the contract, planted otherwise, is caught by export, verify and compare."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from export_model.converters.runtimes.pool import RuntimePool
+from tests.faults.families import members
+from tests.faults.judging import WAYS, Subject
+
+pytestmark = [pytest.mark.xdist_group("runtimes"), pytest.mark.runtimes]
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_metadata_that_is_not_the_contracts_is_caught(way: str, tmp_path: Path, processes: RuntimePool) -> None:
+    pytest.importorskip("onnxruntime")
+    member = next(m for m in members() if m.name == "mjlab")
+    subject = Subject(member, tmp_path, processes)
+    assert subject.judge(None, way).verdict == "passed"
+    edited = [f for f in subject.faults() if f.edit is not None]
+    assert len(edited) == 3
+    found = [subject.judge(fault, way) for fault in edited]
+    assert [o.verdict for o in found] == ["caught"] * 3, [str(o) for o in found]
