@@ -26,7 +26,7 @@ from export_model.exporter.verify.difference import compare
 from export_model.exporter.verify.tolerances import Tolerance, tolerance_for
 from export_model.signatures.errors import DamagedFileError, ExportModelError
 from export_model.signatures.roles import Role
-from export_model.signatures.sampling import FAR_CASES, HUGE_BATCH, draw_cases
+from export_model.signatures.sampling import FAR_CASES, draw_cases
 from tests.corpus.conftest import SHARED
 
 pytestmark = pytest.mark.corpus
@@ -122,6 +122,9 @@ def close(policy: Policy, name: str, expected: np.ndarray, got: np.ndarray, wher
 _ROUNDED = ("1e3", *FAR_CASES)
 #: In all other inputs noise is far, and SAC's log(1 − tanh² + ε) cancels.
 _NEAR_NOISE = ("typical", "pixels")
+#: Where tanh is 1 but for a unit in the last place: log(1 + 2⁻²⁴ / ε) of ε = 1e-6. Measured: 0.0474 in 5 runs, of one
+#: element in 8,192 of the largest batch, and of up to a quarter elsewhere.
+_SATURATED, _RARE, _OFTEN = Tolerance(0.06, 1e-5, "tanh² is 1 or the number below"), 1e-3, 0.3
 
 
 @pytest.mark.parametrize("run", PARAMETERS)
@@ -139,12 +142,25 @@ def test_the_forms_of_a_run_are_one_policy(run: Path, is_new: Callable[[str, Seq
                 if case.name in _ROUNDED or not (every or case.name.startswith(_NEAR_NOISE)):
                     continue
                 ours, theirs = (run_graph(p.graph, case.feeds, names) for p in (mine, reference))
-                # Of thousands of rows some saturate, too, where SAC's probabilities cancel.
-                far = not case.name.startswith(_NEAR_NOISE) or case.batch >= HUGE_BATCH
                 for name in names:
-                    if far and reference.signature.output(name).role is Role.ACTION_PROBS:
-                        continue
-                    close(reference, name, theirs[name], ours[name], f"{form}, {case.name}")
+                    where = f"{form}, {case.name}"
+                    if reference.signature.output(name).role is Role.ACTION_PROBS:
+                        near = case.name.startswith(_NEAR_NOISE)
+                        assert_close_but_for_saturated(reference, name, theirs[name], ours[name], where, near=near)
+                    else:
+                        close(reference, name, theirs[name], ours[name], where)
+
+
+def assert_close_but_for_saturated(
+    policy: Policy, name: str, expected: np.ndarray, got: np.ndarray, where: str, *, near: bool
+) -> None:
+    """Few elements are off, none by more than saturation explains: what is × 0, or an element of it, is off by more."""
+    held = tolerance_for(policy.signature, name, Tolerance())
+    assert (found := compare(expected, got, _SATURATED)).passed, f"{where}: {name}: {found}"
+    beyond = np.abs(got.astype(np.float64) - expected) > held.atol + held.rtol * np.abs(expected)
+    assert beyond.mean() <= (_RARE if near else _OFTEN), f"{where}: {name}"
+    if len(expected) > 1:
+        assert not compare(expected, expected * 0, _SATURATED).passed
 
 
 # ------------------------------------------------------------------ goldens
