@@ -1,7 +1,8 @@
 """``python -m tests.verify.mutants``: single-line breaks of what judges, each run against the judge's fast tests.
 
 A mutant has a number, the same in every run of the same code. By hand, or nightly: a mutant takes seconds. What
-survives is printed with its line. ``--sample N`` runs N of them, spread over all; ``--only FILE`` those of one file.
+survives is printed with its line. ``--sample N`` runs N of them, spread over all; ``--only FILE`` those of one file;
+``--quick`` the tests of seconds alone.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -26,10 +28,10 @@ _WORDS = ("verdict", "findings", "report", "npy", "plays", "options", "session",
 #: Tests that start no runtime, the cheapest first.
 TESTS = (
     *("tests/verify/test_bounds.py", "tests/exporter/test_comparison.py", "tests/verify"),
-    *("tests/faults/test_kept_actions.py::test_columns_that_a_sampler_decides", "tests/compare/test_ports.py"),
-    *("tests/compare/test_budget.py", "tests/exporter/test_bisection.py"),
+    *("tests/compare/test_ports.py", "tests/compare/test_budget.py", "tests/exporter/test_bisection.py"),
     *("tests/exporter/test_verification.py", "tests/exporter/test_what_is_compared.py"),
 )
+QUICK = (*TESTS[:3], "tests/compare/test_budget.py", "tests/exporter/test_bisection.py")
 SECONDS = 240
 _COMPARED = {
     ast.Lt: ast.LtE,
@@ -152,7 +154,7 @@ class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         exec(code, module.__dict__)
 
 
-def survives(mutant: Mutant) -> bool:
+def survives(mutant: Mutant, tests: Sequence[str] = TESTS) -> bool:
     """Whether all tests pass with the break, in a process of its own."""
     child = os.fork()
     if child:
@@ -166,26 +168,22 @@ def survives(mutant: Mutant) -> bool:
         os.dup2(quiet, 1)
         os.dup2(quiet, 2)
         sys.meta_path.insert(0, _Finder(mutant))
-        status = int(pytest.main(["-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", *TESTS]))
+        status = int(pytest.main(["-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", *tests]))
     finally:
         os._exit(status)
 
 
 def _preload() -> None:
     """Import what is not broken once, ahead of the forks."""
-    for name in (
-        "pytest",
-        "onnx",
-        "export_model.converters.compiler.compile",
-        "export_model.converters.runtimes.numpy.child",
-    ):
+    modules = ("onnx", "export_model.converters.compiler.compile", "export_model.converters.runtimes.numpy.child")
+    for name in ("pytest", *modules):
         importlib.import_module(name)
 
 
-def survivors(chosen: Sequence[Mutant], workers: int = 2) -> Iterator[Mutant]:
+def survivors(chosen: Sequence[Mutant], tests: Sequence[str], workers: int = 2) -> Iterator[Mutant]:
     """Those that no test kills."""
     with ThreadPoolExecutor(workers) as threads:
-        for mutant, alive in zip(chosen, threads.map(survives, chosen), strict=True):
+        for mutant, alive in zip(chosen, threads.map(partial(survives, tests=tests), chosen), strict=True):
             if alive:
                 yield mutant
 
@@ -194,16 +192,18 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.verify.mutants", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--sample", type=int, default=0, help="so many, spread over all")
     parser.add_argument("--only", default="", help="those of files whose path holds this")
+    parser.add_argument("--quick", action="store_true", help="with the tests of seconds alone: more survive")
     options = parser.parse_args()
     numbered = [(i, m) for i, m in enumerate(mutants()) if options.only in m.file]
     numbered = numbered[:: max(1, len(numbered) // options.sample)] if options.sample else numbered
     numbers = {m: i for i, m in numbered}
     _preload()
     os.chdir(ROOT)
-    if not survives(Mutant("", 0, 0, 0, "")):
+    tests = QUICK if options.quick else TESTS
+    if not survives(Mutant("", 0, 0, 0, ""), tests):
         raise SystemExit("the tests fail without a break: run them by themselves")
     alive = Counter[str]()
-    for mutant in survivors([m for _, m in numbered]):
+    for mutant in survivors([m for _, m in numbered], tests):
         alive[mutant.file] += 1
         line = (ROOT / mutant.file).read_text().splitlines()[mutant.line - 1].strip()
         print(f"{numbers[mutant]}: {mutant.file}:{mutant.line}: {mutant.what}: {line}", flush=True)
