@@ -104,17 +104,17 @@ def _play_steps(
 
 def compare_decisions(was: np.ndarray, made: np.ndarray) -> tuple[float, str]:
     """How much of what is decided is otherwise, and a sentence that ends before whose decisions those were."""
-    if was.shape != made.shape or not (np.isfinite(was) == np.isfinite(made)).all():
+    finite = np.isfinite(was)
+    if was.shape != made.shape or not (finite == np.isfinite(made)).all():
         return math.inf, "it is of another shape, or finite elsewhere, than that of"
     if was.dtype.kind != "f":
         other = int((was != made).sum())
         share = other / max(was.size, 1)
         return share, f"{other} of {was.size} choices ({share:.2%}) are other ones than those of"
-    with np.errstate(invalid="ignore"):
-        wide, off = was.astype(np.float64), np.nan_to_num(made.astype(np.float64) - was)
-    size = np.sqrt(np.mean(np.nan_to_num(wide) ** 2, axis=0))
-    varies = np.maximum(np.std(np.nan_to_num(wide), axis=0), _STILL * size)
-    moved = np.sqrt(np.mean(off**2, axis=0))
+    wide, moved = (np.where(finite, a, 0).astype(np.float64) for a in (was, made))
+    size = np.sqrt(np.mean(wide**2, axis=0))
+    varies = np.maximum(np.std(wide, axis=0), _STILL * size)
+    moved = np.sqrt(np.mean((moved - wide) ** 2, axis=0))
     share = float(np.divide(moved, varies, out=np.where(moved > 0, np.inf, 0.0), where=varies > 0).max(initial=0.0))
     return share, f"it moved by {share:.2%} of its spread from that of"
 
