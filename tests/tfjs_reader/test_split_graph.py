@@ -134,6 +134,39 @@ def test_zeros_as_tensorflow_writes_them_are_zeros() -> None:
         read_graph(graph_bytes([placeholder("x"), zeros, weights, *layers]))
 
 
+@pytest.mark.parametrize("between", [(), ("Identity",), ("Identity", "Identity", "StopGradient")], ids=len)
+@pytest.mark.parametrize("op", ["MatMul", "Conv2D", "DepthwiseConv2dNative"])
+def test_a_kernel_without_values_is_no_zeros(op: str, between: tuple[str, ...]) -> None:
+    """Beside filled constants, too: whoever cleared one field of several leaves those of one value."""
+    kernel = constant("kernel", np.ones((3, 2) if op == "MatMul" else (1, 1, 3, 2), np.float32))
+    ones = constant("ones", np.ones(2, np.float32))
+    read, names = "kernel", [f"read_{i}" for i in range(len(between))]
+    passed = []
+    for name, kind in zip(names, between, strict=True):
+        passed.append(node(name, kind, read))
+        read = name
+    nodes = [
+        placeholder("x"),
+        kernel,
+        ones,
+        *passed,
+        node("product", op, "x", read),
+        node("y", "Mul", "product", "ones"),
+    ]
+    read_graph(graph_bytes(nodes))
+    kernel.attr["value"].tensor.ClearField("tensor_content")
+    with pytest.raises(DamagedFileError, match="hold no values"):
+        read_graph(graph_bytes(nodes))
+
+
+def test_a_state_without_values_is_zeros() -> None:
+    """What a product multiplies may be zeros, as a cell's first state is."""
+    state, kernel = constant("state", np.ones((1, 3), np.float32)), constant("kernel", np.ones((3, 2), np.float32))
+    state.attr["value"].tensor.ClearField("tensor_content")
+    graph = read_graph(graph_bytes([state, kernel, node("product", "MatMul", "state", "kernel")]))
+    assert not graph.constant("state").any()  # type: ignore[union-attr]
+
+
 def test_a_saved_model_without_values_is_refused(tmp_path: Path) -> None:
     (made,) = export([path("continuous")], ExportOptions(tmp_path, targets=("saved_model",), verify="none"))
     file = made.folder / "saved_model" / "saved_model.pb"

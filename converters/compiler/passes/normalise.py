@@ -57,6 +57,7 @@ def _complete_attrs(node: Node) -> Node:
     for name, attr in known.items():
         given = node.attrs.get(name)
         if attr.derive is not None:
+            _check_count(node, attr, given)
             continue
         if given is None:
             if attr.default is REQUIRED:
@@ -80,6 +81,20 @@ def _complete_attrs(node: Node) -> Node:
         attrs[name] = given if attr.supported else attr.default
     same = attrs.keys() == node.attrs.keys() and all(attrs[name] is node.attrs[name] for name in attrs)
     return node if same else replace(node, attrs=attrs)
+
+
+def _check_count(node: Node, attr: Attr, given: Any) -> None:
+    """Raise GraphError where a node says to have other than the inputs that it has: every TensorFlow refuses it."""
+    side, _, others = str(attr.derive).partition(":")
+    if side != "count" or given is None:
+        return
+    count = len(node.inputs) - int(others or 0)
+    if given != count:
+        raise GraphError(
+            f"node {node.name!r} ({node.op}) says {attr.name}={given}, and has {count} inputs",
+            why="it is how many it joins",
+            fix="the graph is damaged; freeze it again from its checkpoint",
+        )
 
 
 #: What an attribute of each kind is, or each item of a list of them.

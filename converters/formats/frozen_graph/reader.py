@@ -12,7 +12,8 @@ import numpy as np
 
 from export_model.converters.files import tensorflow_messages as schema
 from export_model.converters.files.external_data import Detached
-from export_model.converters.formats.frozen_graph.tensors import lacks_values, to_array
+from export_model.converters.formats.frozen_graph.emptied import lacks_values
+from export_model.converters.formats.frozen_graph.tensors import to_array
 from export_model.converters.graph.nodes import Graph, Node, TensorShape, node_of, normal_ref, topological
 from export_model.converters.graph.ops.table import CALLS, is_fed
 from export_model.converters.graph.size_limits import Allowance

@@ -29,7 +29,6 @@ _VALUE_FIELDS = {
     "uint32": "uint32_val",
     "uint64": "uint64_val",
 }
-_FLOATS = frozenset(dtype_number(np.dtype(name)) for name in ("float16", "float32", "float64"))
 
 
 def to_array(proto: Any, allowance: Allowance | None = None, detached: Detached | None = None) -> np.ndarray:
@@ -62,18 +61,6 @@ def to_array(proto: Any, allowance: Allowance | None = None, detached: Detached 
         last = values[-1] if values.size else dtype.type(0)
         values = np.concatenate([values, np.full(count - values.size, last, dtype)])
     return values.reshape(shape)
-
-
-def lacks_values(graph_def: Any) -> bool:
-    """Whether the values of a graph's constants were taken out of it: what is left must not be read as zeros.
-
-    That one constant has no value field says nothing: TensorFlow's constant folding (grappler of 2.21, ``constfold``)
-    writes zeros so, biases of [70] and of [5] and scalars alike, and its loader reads them as zeros. (``tf.constant``,
-    ``tf.zeros`` and freezing write all bytes, or one value for all.) But not all weights are zeros.
-    """
-    constants = (n.attr["value"].tensor for n in graph_def.node if n.op == "Const" and "value" in n.attr)
-    floats = [t for t in constants if t.dtype in _FLOATS and math.prod(d.size for d in t.tensor_shape.dim) > 1]
-    return bool(floats) and not any(t.tensor_content or t.float_val or t.double_val or t.half_val for t in floats)
 
 
 def _values(proto: Any, dtype: np.dtype) -> np.ndarray:

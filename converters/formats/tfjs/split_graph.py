@@ -19,8 +19,9 @@ from export_model.converters.files import tensorflow_messages as schema
 from export_model.converters.files.external_data import Detached
 from export_model.converters.files.fetch import Fetched, read_bytes
 from export_model.converters.files.file_probe import Content, json_in
+from export_model.converters.formats.frozen_graph.emptied import lacks_values
 from export_model.converters.formats.frozen_graph.reader import from_graph_def
-from export_model.converters.formats.frozen_graph.tensors import from_array, lacks_values
+from export_model.converters.formats.frozen_graph.tensors import from_array
 from export_model.converters.formats.source import OriginalRun, ReadOptions, SourceModel
 from export_model.converters.formats.tfjs.reader import reshape_constant, weights_of
 from export_model.signatures.errors import DamagedFileError, ExportModelError, SourceError
