@@ -48,6 +48,7 @@ class Rounding:
         self._jitters = [seed * every + run for run in range(every)]
         self._names, self._settled = list(names), settled
         self._known: dict[tuple[str, str, bool], list[Arrays]] = {}
+        self._scores: dict[tuple[str | int, str, str], np.ndarray] = {}
 
     def outputs(self, model: LoadedModel, case: Case, runtime: str, *, sure: bool) -> Mapping[str, np.ndarray]:
         """Of the numpy child's ``model`` for one input."""
@@ -97,6 +98,13 @@ class Rounding:
         arithmetic = _ARITHMETIC.get(runtime, "processor")
         moved = [run_graph(graph, feeds, [tensor], Jitter(j, arithmetic))[tensor] for j in self._runs()]
         return _largest(exact, moved)
+
+    def scores(self, runtime: str, graph: Graph, at: Case | int, feeds: Feeds, tensor: str) -> np.ndarray:
+        """Of a tensor inside the policy's own ``graph`` for one input or step, whose outputs all hang on it."""
+        key = (at.name if isinstance(at, Case) else at, _ARITHMETIC.get(runtime, "processor"), tensor)
+        if key not in self._scores:
+            self._scores[key] = self.inner(runtime, graph, feeds, tensor)
+        return self._scores[key]
 
     def _runs(self, sure: bool = False) -> Sequence[int]:
         return self._jitters if sure else self._jitters[:RUNS]

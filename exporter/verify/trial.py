@@ -218,7 +218,7 @@ class Trial:
         if expected[name].shape != asked.got.shape or not self.choices.behind(name):
             return None
         feeds = asked.at.feeds if isinstance(asked.at, Case) else self._fed_at(asked.at)
-        moved = partial(self.rounding.inner, participant.runtime, runnable(self.tested.graph))
+        moved = partial(self.rounding.scores, participant.runtime, runnable(self.tested.graph), asked.at)
         others = self.choices.others(name, feeds, self._choice_tolerance(name, participant), moved)
         made = broken_ties(expected[name], others, asked.got, self.tolerance(name, participant))
         if made is None:
