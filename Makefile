@@ -103,6 +103,7 @@ bench: install
 	$(BIN)/python -m tests.bench.latency
 	$(BIN)/python -m tests.bench.litert
 	$(BIN)/python -m tests.bench.programs
+	$(BIN)/python -m tests.bench.robots
 	$(BIN)/python -m tests.bench.verification
 	$(BIN)/python -m tests.bench.play
 	$(BIN)/python -m tests.bench.throughput --write

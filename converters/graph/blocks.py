@@ -12,7 +12,7 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from export_model.converters.graph.ops.loops.base import Applied, Counter, Element, Number, Reduced
+from export_model.converters.graph.ops.loops.base import Applied, Counter, Element, Expression, Number, Reduced
 from export_model.converters.graph.program import Place, every
 from export_model.converters.graph.types import FLOAT32
 
@@ -47,12 +47,28 @@ def stride_of(x: Element, counter: Counter) -> int | None:
     """How far apart the elements for two numbers of a counter lie, one after the other; None if that varies."""
     stride, distance = 1, 0
     for length, one in reversed(list(zip(x.tensor.shape, x.at, strict=True))):
-        if one is counter:
-            distance += stride
-        elif any(e is counter for e in every(one)):
+        slope = _slope(one, counter)
+        if slope is None:
             return None
+        distance += stride * slope
         stride *= length
     return distance
+
+
+def _slope(x: Expression, counter: Counter) -> int | None:
+    """How much an index grows as a counter does; None if that varies."""
+    if x is counter:
+        return 1
+    if not any(e is counter for e in every(x)):
+        return 0
+    if isinstance(x, Applied) and x.function in ("add", "sub", "mul"):
+        a, b = (_slope(o, counter) for o in x.operands)
+        times = x.operands[1]
+        if x.function != "mul" and a is not None and b is not None:
+            return a + b if x.function == "add" else a - b
+        if x.function == "mul" and a is not None and isinstance(times, Number):
+            return a * int(times.value)
+    return None
 
 
 def packed_in(summed: Reduced, counter: Counter) -> tuple[Packed, Element, Reduced] | None:

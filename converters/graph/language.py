@@ -65,14 +65,26 @@ class Language(ABC):
     terms = 1
     #: Whether constants are read in blocks (``export_model.converters.graph.blocks``).
     blocks = False
+    #: Whether terms of a reduction are added to a row in place (``export_model.converters.graph.rows``).
+    rows = False
+    #: What stands before a loop over a row, which nothing that is read overlaps with.
+    apart = ""
     #: How a finite float32 stands in an array, where its type is said before.
     element = "{}f"
     #: What the variable of a loop is declared as.
     counter = "int"
 
+    #: Mathematical functions that are ours in any case.
+    fast: frozenset[str] = frozenset()
+    #: How the definition of a function begins that loops call, where a compiler puts it into them.
+    inline = ""
+    #: How a float32 within the range of an int32 becomes one.
+    whole = "(int){}"
+
     def __init__(self, own: bool = False) -> None:
         self.helpers: dict[str, str] = {}
         self.own = own
+        self.ours = frozenset(OWN) if own else self.fast
 
     @abstractmethod
     def literal(self, value: float, dtype: np.dtype) -> str:
@@ -103,7 +115,7 @@ class Language(ABC):
     def definition(self, name: str, takes: Sequence[str], lines: Sequence[str], result: str) -> str:
         """The definition of a function of float32: its statements, and what it gives."""
         words = ", ".join(f"float {a}" for a in takes)
-        return "\n".join([f"static float {name}({words})\n{{", *lines, f"    return {result};\n}}"])
+        return "\n".join([f"static {self.inline}float {name}({words})\n{{", *lines, f"    return {result};\n}}"])
 
     @abstractmethod
     def draw(self) -> str:
@@ -135,7 +147,7 @@ class Language(ABC):
     def applied(self, x: Applied, operands: Sequence[str]) -> str:
         """A function of operands."""
         function = x.function
-        if self.own and function in OWN:
+        if function in self.ours:
             return f"{self.own_name(function)}({', '.join(map(bare, operands))})"
         if function in _INFIX:
             return self.round_to(f"({operands[0]} {_INFIX[function]} {operands[1]})", x)
@@ -143,6 +155,8 @@ class Language(ABC):
             return operands[1 if x.operands[0].value else 2]
         if function == "select":
             return f"({operands[0]} ? {operands[1]} : {operands[2]})"
+        if function == "whole":
+            return f"({self.whole.format(operands[0])})"
         if function == "cast":
             return self.cast(operands[0], x.operands[0].dtype, x.dtype)
         if function in ("neg", "not"):

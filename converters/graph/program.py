@@ -27,6 +27,7 @@ from export_model.converters.graph.ops.loops.base import (
     Number,
     Reduced,
     Tensor,
+    apply,
     loop_error,
     number,
 )
@@ -201,7 +202,7 @@ def inline_scalars(x: Expression, swap: Mapping[int, Expression] | None = None) 
                 else replace(one, at=tuple(map(visit, one.at)))
             )
         elif isinstance(one, Applied):
-            made = replace(one, operands=tuple(map(visit, one.operands)))
+            made = apply(one.function, *map(visit, one.operands), dtype=one.dtype)
         elif isinstance(one, Reduced):
             made = replace(one, body=visit(one.body))
         done[id(one)] = made

@@ -50,11 +50,16 @@ _SUFFIX = {"float": "f", "int32_t": "i", "int64_t": "l"}
 class C(Language):
     """C99; ``prefix`` begins every name of file scope."""
 
+    rows = True
+    fast = frozenset(("exp", "expm1", "tanh"))
+    inline, whole = "inline ", "(int32_t){}"
     functions = {name: f"{name}f({{0}})" for name in _SAME} | {"pow": "powf({0}, {1})"}
 
-    def __init__(self, prefix: str, own: bool = False) -> None:
+    def __init__(self, prefix: str, own: bool = False, loads: bool = False) -> None:
         super().__init__(own)
         self.prefix = prefix
+        if loads:  # gcc -O2 makes no vectors where a row might overlap with weights that a pointer leads to
+            self.apart = f"{prefix.upper()}_APART"
 
     def literal(self, value: float, dtype: np.dtype) -> str:
         """A number as C reads it, to the last bit."""
@@ -96,7 +101,7 @@ class C(Language):
         if function in _RAW:
             said, takes = _RAW[function]
             name = f"{self.prefix}_{function}"
-            self.helpers[name] = f"static {kind} {name}({takes} a) {{ {said} }}"
+            self.helpers[name] = f"static inline {kind} {name}({takes} a) {{ {said} }}"
             return f"{name}({bare(operands[0])})"
         name = f"{self.prefix}_{function}{_SUFFIX[kind]}"
         takes = ", ".join(f"{kind} {a}" for a in "ab"[: len(operands)])
@@ -115,6 +120,6 @@ class C(Language):
 
     def constant(self, place: Place, name: str) -> str:
         """The definition of a constant."""
-        words = self.elements(place)
-        kind = C_TYPES[place.dtype.name]
-        return f"static const {kind} {name}[{max(1, place.size)}] = {{\n    {lines_of(words)}\n}};"
+        words, kind = lines_of(self.elements(place)), C_TYPES[place.dtype.name]
+        line = f"{self.prefix.upper()}_ALIGNED static const {kind}"
+        return f"{line} {name}[{max(1, place.size)}] = {{\n    {words}\n}};"

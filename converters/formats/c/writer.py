@@ -50,6 +50,31 @@ static void $P_normal($P_memory *memory, float *out, int count)
     }
 }
 """
+#: What gcc is told: speculation raises no flag that anyone reads, and 16 terms at a time do not fit into registers.
+_VECTORS = """
+#if defined(__GNUC__) && !defined(__clang__) && __GNUC__ >= 8
+#pragma GCC push_options
+#pragma GCC optimize ("no-trapping-math", "no-loop-unroll-and-jam", "no-tree-loop-distribute-patterns")
+#endif
+#if defined(__GNUC__) && defined(__AVX__)
+#define $U_ALIGNED __attribute__((aligned(64))) /* a line of the cache */
+#else
+#define $U_ALIGNED
+#endif
+"""
+_APART = """
+#if defined(__GNUC__) && !defined(__clang__)
+#define $U_APART _Pragma("GCC ivdep")
+#else
+#define $U_APART
+#endif
+"""
+_END = """
+#if defined(__GNUC__) && !defined(__clang__) && __GNUC__ >= 8
+#pragma GCC pop_options
+#endif
+#endif
+"""
 _STRICT = """
 /* The same bits on every processor: every operation is rounded to float, and none is fused with another. */
 #if defined(__FAST_MATH__) || FLT_EVAL_METHOD < 0 || FLT_EVAL_METHOD == 1 || FLT_EVAL_METHOD == 2
@@ -90,7 +115,7 @@ def write(policy: Policy, options: WriteOptions) -> dict[str, Pieces]:
 def _text(name: str, plan: Plan) -> str:
     plan = replace(plan, program=widen_where_used(plan.program, plan.weights))
     header, program, p = plan.header, plan.program, plan.header.prefix
-    words = C(p, plan.code.math == "own")
+    words = C(p, plan.code.math == "own", plan.weights.file is not None)
     printer = Printer(words, f"{p}_w_")
     by_name = {f.spec.name: f"input->{f.name}" for f in header.inputs}
     by_name |= {f.spec.name: f"memory->{f.name}" for f in header.own_values}
@@ -188,6 +213,7 @@ def _definitions(plan: Plan, printer: Printer, words: C, body: Sequence[str], ch
     return [
         f"#ifdef __cplusplus\n}}\n#endif\n\n#endif\n\n"
         f"#ifdef {p.upper()}_IMPLEMENTATION\n#include <float.h>\n#include <math.h>\n#include <string.h>",
+        (_VECTORS + _APART * loads).replace("$U", p.upper()).strip(),
         *([_STRICT.strip()] if words.own else []),
         *(words.constant(place, printer.name(place)) for place, offset in places_of(plan) if offset is None),
         *words.helpers.values(),
@@ -215,7 +241,7 @@ def _definitions(plan: Plan, printer: Printer, words: C, body: Sequence[str], ch
         *([choose] if choose else []),
         *([unusual_text(plan, words)] if plan.guarded else []),
         _selftest(plan, words),
-        "#endif",
+        _END.strip(),
     ]
 
 

@@ -62,7 +62,7 @@ _HELPERS = {
 class JavaScript(Language):
     """An ES module."""
 
-    element, counter = "{}", "let"
+    element, counter, whole = "{}", "let", "{} | 0"
     functions = (
         {name: f"Math.{name}({{0}})" for name in _SAME}
         | {name: f"_{name}({{0}})" for name in ("erf", "rint")}

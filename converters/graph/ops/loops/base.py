@@ -23,6 +23,7 @@ FUNCTIONS = frozenset(
         *("add", "sub", "mul", "div", "neg", "abs", "floor", "ceil", "rint", "min", "max", "pow", "mod", "intdiv"),
         *("exp", "expm1", "log", "log1p", "sqrt", "sin", "cos", "tan", "tanh", "erf"),
         *("less", "less_equal", "equal", "and", "or", "not", "select", "cast"),
+        "whole",  # an int32 of a float32 within its range, towards zero
         *("bits", "of_bits"),  # an int32 of the bits of a float32, and back
         "within",  # an index, and how many there are: the program answers nothing where it lies outside
     )

@@ -74,17 +74,17 @@ def _within(x: Expression, low: float, high: float) -> Expression:
     return _choose(holds("less", _f(low), x), _choose(holds("less", x, _f(high)), x, _f(high)), _f(low))
 
 
-#: 1.5 * 2 to the 23: what is added to it is rounded to a whole number, which its last bits then hold.
-_ROUNDER = 12582912.0
-_ROUNDER_BITS = 0x4B400000
 #: ln 2 in two parts; the first has so few bits that its multiples are exact.
 _LN2 = (0.693359375, -2.12194440e-4)
 
 
-def _nearest(x: Expression) -> tuple[Expression, Expression]:
-    """The nearest whole number, as a float and as an integer; |x| is below 2 to the 22."""
-    shifted = _add(x, _f(_ROUNDER))
-    return _sub(shifted, _f(_ROUNDER)), _sub(_bits(shifted), number(_ROUNDER_BITS))
+def _nearest(x: Expression, above: int = 0) -> tuple[Expression, Expression]:
+    """The nearest whole number, as a float and as an integer; x is larger than -``above``, and below 2 to the 22.
+
+    No branch, and no sum that ``-ffast-math`` takes back.
+    """
+    k = _sub(apply("whole", _add(x, _f(above + 0.5)), dtype=INT32), number(above))
+    return apply("cast", k, dtype=FLOAT32), k
 
 
 def _less_multiple(x: Expression, count: Expression, parts: tuple[float, ...]) -> Expression:
@@ -104,23 +104,32 @@ def _expm1_near_zero(r: Expression) -> Expression:
     return _add(_mul(_mul(r, r), _polynomial(r, *factors)), r)
 
 
+def _powers(k: Expression) -> tuple[Expression, Expression, Expression]:
+    """2 to the k by two factors, of which each is a normal number, and 2 to the -k."""
+    half = _div(k, number(2))
+    rest = _sub(k, half)
+    back = _mul(_power_of_two(_sub(number(0), half)), _power_of_two(_sub(number(0), rest)))
+    return _power_of_two(half), _power_of_two(rest), back
+
+
 def exp(x: Expression) -> Expression:
     """A power of two, in two steps (the result may be below the least normal number), times what is left."""
     within = _within(x, -104.0, 89.0)
-    count, k = _nearest(_mul(within, _f(1.44269504)))
+    count, k = _nearest(_mul(within, _f(1.44269504)), 151)
     near = _add(_f(1), _expm1_near_zero(_less_multiple(within, count, _LN2)))
-    half = _div(k, number(2))
-    scaled = _mul(_mul(near, _power_of_two(half)), _power_of_two(_sub(k, half)))
+    first, second, _ = _powers(k)
+    scaled = _mul(_mul(near, first), second)
     return _choose(_is_number(x), scaled, x)
 
 
 def expm1(x: Expression) -> Expression:
-    """2 to the k times (exp(r) - 1), and 2 to the k less 1; beyond 17.4 the 1 is lost in rounding, or all."""
-    within = _within(x, -17.4, 17.4)
-    count, k = _nearest(_mul(within, _f(1.44269504)))
-    scale = _power_of_two(k)
-    near = _add(_mul(scale, _expm1_near_zero(_less_multiple(within, count, _LN2))), _sub(scale, _f(1)))
-    return _choose(holds("less", apply("abs", x), _f(17.4)), near, _sub(apply("exp", x), _f(1)))
+    """2 to the k times (exp(r) - 1 + 1 - 2 to the -k), of the same steps for every number: no branch."""
+    within = _within(x, -17.4, 89.0)
+    count, k = _nearest(_mul(within, _f(1.44269504)), 151)
+    first, second, back = _powers(k)
+    near = _add(_expm1_near_zero(_less_multiple(within, count, _LN2)), _sub(_f(1), back))
+    scaled = _mul(_mul(near, first), second)
+    return _choose(_is_number(x), scaled, x)
 
 
 def log(x: Expression) -> Expression:
@@ -153,14 +162,11 @@ def log1p(x: Expression) -> Expression:
 
 
 def tanh(x: Expression) -> Expression:
-    """An odd polynomial near zero, else 1 - 2 / (exp(2 |x|) + 1)."""
+    """-e / (e + 2) with e = exp(-2 |x|) - 1, and the sign of x."""
     size = apply("abs", x)
-    z = _mul(x, x)
-    factors = (-5.70498872745e-3, 2.06390887954e-2, -5.37397155531e-2, 1.33314422036e-1, -3.33332819422e-1)
-    near = _add(_mul(_mul(_polynomial(z, *factors), z), x), x)
-    far = _sub(_f(1), _div(_f(2), _add(apply("exp", _add(size, size)), _f(1))))
-    signed = _choose(holds("less", x, _f(0)), apply("neg", far), far)
-    return _choose(holds("less", size, _f(0.625)), near, signed)
+    e = apply("expm1", apply("neg", _add(size, size)))
+    found = _div(e, _add(e, _f(2)))
+    return _choose(holds("less", x, _f(0)), found, apply("neg", found))
 
 
 #: pi / 2 in three parts, whose multiples are exact for the first two while the angle is below ``_TURNS``.
@@ -244,7 +250,7 @@ OWN: Mapping[str, Own] = {
     "expm1": Own(expm1, 2.0),
     "log": Own(log, 1.0),
     "log1p": Own(log1p, 2.0),
-    "tanh": Own(tanh, 2.0),
+    "tanh": Own(tanh, 3.0),
     "sin": Own(sin, 3.0, _ANGLES),
     "cos": Own(cos, 3.0, _ANGLES),
     "tan": Own(tan, 5.0, _ANGLES),
