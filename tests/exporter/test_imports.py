@@ -202,6 +202,18 @@ def test_no_room_of_a_room_imports_itself_round_a_corner() -> None:
     assert not left, f"these rooms import each other: {left}"
 
 
+def test_a_class_has_a_name_of_its_own() -> None:
+    """A reader of one room takes its words for those of another; a few pairs are users' words, or two rooms' own."""
+    homes: dict[str, list[str]] = {}
+    for path in MODULES:
+        for found in tree_of(path).body:
+            if isinstance(found, ast.ClassDef):
+                homes.setdefault(found.name, []).append(name_of(path))
+    shared = {name: files for name, files in homes.items() if len(files) > 1}
+    assert len(homes) > 500
+    assert len(shared) <= 10, shared
+
+
 def test_readers_name_no_trainer() -> None:
     """A trainer is a room and a line of the registry: no reader asks one by its name."""
     from export_model.converters.trainers.registry import ROOMS
