@@ -365,8 +365,12 @@ def unknown_ids(signature: PolicySignature) -> list[str]:
 
 
 def _is_free(spec: TensorSpec) -> bool:
+    """Whether a style draws the numbers of an input, some of an integer one's at least: those that are no ids."""
     decided = (Role.MASKS, Role.PREV_ACTION, Role.VISUAL, Role.NOISE, Role.MEMORY_IN, Role.PARAMETER)
-    return spec.role not in decided and np.dtype(spec.dtype).kind not in "iu"
+    if spec.role in decided or np.dtype(spec.dtype).kind not in "iu":
+        return spec.role not in decided
+    bounds = id_bounds(spec)
+    return bounds is not None and not np.isfinite(bounds[1]).all()
 
 
 def _opposite_signs(signature: PolicySignature) -> np.ndarray:

@@ -270,3 +270,25 @@ def test_a_wide_or_empty_observation_takes_memory_for_its_own_numbers(width: int
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 4 * feeds + (1 << 20)
+
+
+_BOUNDS = [(shape, high) for shape in ((3,), (3, 5, 4), ()) for high in (None, 6)] + [((3,), [6, None, 2])]
+
+
+@pytest.mark.parametrize("place", [0, 1, 2])
+@pytest.mark.parametrize(("shape", "high"), _BOUNDS, ids=str)
+def test_integers_of_any_size_are_drawn_wherever_they_stand(high: Any, place: int, shape: tuple[int, ...]) -> None:
+    """A board of integers that nothing bounds ended an export in a traceback: it had no signs of its own."""
+    low = [0 if n is not None else None for n in high] if isinstance(high, list) else None if high is None else 0
+    board = TensorSpec(
+        "board", Role.VECTOR, "int32", (None, *shape), distribution={"kind": "integer", "low": low, "high": high}
+    )
+    others = [TensorSpec(f"state_{i}", Role.VECTOR, "float32", (None, 4)) for i in range(2)]
+    cases = draw_cases(signature(*others[:place], board, *others[place:]))
+    drawn = np.concatenate([case.feeds["board"].reshape(-1, *shape) for case in cases])
+    assert drawn.dtype == np.int32
+    if high is None:
+        assert drawn.min() < -100 < 100 < drawn.max()
+    elif high == 6:
+        assert drawn.min() >= 0
+        assert drawn.max() <= 6
