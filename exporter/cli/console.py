@@ -16,12 +16,17 @@ from export_model.exporter.cli.terminal import Bar, Progress, say, say_json, say
 from export_model.signatures.errors import ExportModelError, UsageError
 
 if TYPE_CHECKING:
+    from export_model.converters.policy.policy import Policy
+    from export_model.exporter.export.options import ExportOptions
     from export_model.exporter.export.pipeline import ExportResult
     from export_model.exporter.play.report import PlayReport
     from export_model.exporter.reports.entry import Entry
     from export_model.exporter.reports.write import Documents
     from export_model.exporter.verify.report import ParityReport
     from export_model.exporter.verify.tolerances import ToleranceRule
+
+#: Bytes of weights above which a file beside the source is proposed.
+_MANY_WEIGHTS = 4_000_000
 
 
 def _colour(reports: Sequence[ParityReport]) -> str:
@@ -121,6 +126,19 @@ class Console(Struct, frozen=True):
 
             echo = functools.partial(say_lines, keep=UNSEEN)
             Destinations(self.junit, self.markdown, self.html).write(documents, echo)
+
+    def note_size(self, policy: Policy, job: ExportOptions) -> None:
+        """Name ``--weights file`` before weights are written as text, where they are many."""
+        from export_model.converters.formats.registry import WRITTEN
+
+        programs = [key for key in job.targets or () if key in WRITTEN and WRITTEN[key].program]
+        if not programs or job.code.weights == "file" or self.quiet or self._silent:
+            return
+        count = sum(n.value.size for n in policy.graph.nodes if n.value is not None)
+        if count * 4 > _MANY_WEIGHTS:
+            text, file = (f"{count * size / 1e6:.0f} MB" for size in (16, 4))
+            said = f"the weights of {policy.name} take {text} as text ({','.join(programs)}), {file} by --weights file"
+            say_lines(f"note: {said}", err=True)
 
     # ---- results, for people
 

@@ -154,6 +154,8 @@ def _export_few(sources: Sequence[Path], job: ExportOptions, env: str | None, co
     """Export sources in this process, and leave with the status of what came of it."""
 
     def check_fit(policies: Sequence[Policy]) -> None:
+        for policy in policies:
+            console.note_size(policy, job)
         if env is not None:
             from export_model.exporter.play.named import world_maker
 

@@ -67,11 +67,13 @@ class Progress(AbstractContextManager["Progress"]):
         self._lines = verbose
         self._shown = not quiet and not verbose and sys.stderr.isatty() and os.environ.get("TERM") != "dumb"
         self._start = time.monotonic()
+        self._steps: list[tuple[float, str]] = []
 
     def __call__(self, text: str) -> None:
         """Say that a step begins."""
         if self._lines:
-            say(f"{time.monotonic() - self._start:7.1f} s  {text}", err=True)
+            self._steps.append((time.monotonic() - self._start, text))
+            say(f"{self._steps[-1][0]:7.1f} s  {text}", err=True)
         elif self._shown:
             room = shutil.get_terminal_size().columns - 3
             click.echo(f"{_ERASE}  {printable(text)[:room]}", nl=False, err=True, color=True)
@@ -83,6 +85,12 @@ class Progress(AbstractContextManager["Progress"]):
 
     def __exit__(self, *error: object) -> None:
         self.clear()
+        if self._steps:
+            ends = [*(begun for begun, _ in self._steps[1:]), time.monotonic() - self._start]
+            took = [(end - begun, text) for end, (begun, text) in zip(ends, self._steps, strict=True)]
+            say("where the time went:", err=True)
+            for seconds, text in sorted(took, key=lambda each: -each[0]):
+                say(f"{seconds:7.1f} s  {text}", err=True)
 
 
 class Bar:

@@ -183,6 +183,7 @@ class Exporter:
         options, dress = self.options, self._dress
         progress(f"reading {path.path if isinstance(path, Source) else path}")
         source = path if isinstance(path, Source) else read_source(path, options.read, refused)
+        progress(f"compiling {source.path}")
         if refused is None:
             found = list(source.compile_models(options.compile))
         else:
@@ -216,6 +217,7 @@ class Exporter:
         """
         for job in jobs:
             check_free(self.options.out, job.policy.name)
+        progress(f"writing {', '.join(job.policy.name for job in jobs)}")
         made = [(j, *artefacts_of(j, self._formats, self.options)) for j in jobs]
         for number, (job, contract, artifacts, notes) in enumerate(made, 1):
             result = self._verify_job(job, contract, artifacts, pool, numbered_progress(progress, number, len(made)))

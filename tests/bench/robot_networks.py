@@ -79,9 +79,13 @@ class Network:
         return sum(a * b for a, b in self.products)
 
 
-def _dense(name: str, sizes: tuple[int, ...], activation: str) -> Network:
-    return Network(name, {"obs": (1, sizes[0])}, {"action": (1, sizes[-1])},
-                   lambda m: [m.dense("obs", sizes, activation), None][1])  # fmt: skip
+def dense_network(name: str, sizes: tuple[int, ...], activation: str) -> Network:
+    """Dense layers, each but the last with an activation."""
+
+    def make(m: _Maker) -> None:
+        m.dense("obs", sizes, activation)
+
+    return Network(name, {"obs": (1, sizes[0])}, {"action": (1, sizes[-1])}, make)
 
 
 def _recurrent(op: str, gates: int) -> Callable[[_Maker], None]:
@@ -122,8 +126,8 @@ def _camera(m: _Maker) -> None:
 
 _STATE = (1, 1, 256)
 NETWORKS = (
-    _dense("robot", (48, 512, 256, 128, 12), "Elu"),
-    _dense("tanh64", (17, 64, 64, 6), "Tanh"),
+    dense_network("robot", (48, 512, 256, 128, 12), "Elu"),
+    dense_network("tanh64", (17, 64, 64, 6), "Tanh"),
     Network("lstm256", {"obs": (1, 48), "h_in": _STATE, "c_in": _STATE},
             {"action": (1, 12), "h_out": _STATE, "c_out": _STATE}, _recurrent("LSTM", 4)),
     Network("gru256", {"obs": (1, 48), "h_in": _STATE}, {"action": (1, 12), "h_out": _STATE}, _recurrent("GRU", 3)),
