@@ -26,19 +26,17 @@ from tests.faults.judging import Fault, Outcome, Subject
 from tests.faults.page import totals
 from tests.figures import FIGURES, PAGE, page
 
-#: Faults of a member of the sample, and members of a family in one format.
-SAMPLED, OF_A_FAMILY = 4, 2
+#: Faults of a member of the sample.
+SAMPLED = 3
 
 
 def sample(given: Iterable[Member]) -> list[Member]:
-    """The first members of every family in every format."""
-    counts = Counter[tuple[str, str]]()
-    found = []
+    """The first member of every family in every format, profile and way to write it."""
+    found: dict[str, Member] = {}
     for member in given:
-        counts[member.family, member.form] += 1
-        if counts[member.family, member.form] <= (OF_A_FAMILY if member.form == "onnx" else 1):
-            found.append(member)
-    return found
+        how = sorted(str(v) for v in member.more.values())
+        found.setdefault(f"{member.family} {member.form} {how}", member)
+    return list(found.values())
 
 
 class Turns:
@@ -69,9 +67,10 @@ def outcomes(
     count: int | None = None,
     every: bool = False,
     ways: Sequence[str] = (),
+    turns: Turns | None = None,
 ) -> Iterator[Outcome]:
     """What comes of each fault, each judged in one way in turn (``ways``: in these); a policy without one first."""
-    turns = Turns()
+    turns = turns or Turns()
     for number, member in enumerate(given):
         with tempfile.TemporaryDirectory() as folder:
             try:
