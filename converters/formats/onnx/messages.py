@@ -47,7 +47,7 @@ _CLASSES = message_classes(
         ),
         "NodeProto": (
             "1 input string*, 2 output string*, 3 name string, 4 op_type string, 5 attribute AttributeProto*, "
-            "7 domain string, 8 overload string"
+            "7 domain string, 8 overload string, 9 metadata_props StringStringEntryProto*"
         ),
         "GraphProto": (
             "1 node NodeProto*, 2 name string, 5 initializer TensorProto*, 11 input ValueInfoProto*, "
