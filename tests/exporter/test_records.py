@@ -20,7 +20,9 @@ PACKAGES = ("signatures", "converters", "exporter")
 
 def modules(package: str) -> Iterator[ModuleType]:
     """Every module of a package, but what runs as a program."""
-    for found in pkgutil.walk_packages(importlib.import_module(package).__path__, f"{package}."):
+    for found in pkgutil.walk_packages(
+        importlib.import_module(f"export_model.{package}").__path__, f"export_model.{package}."
+    ):
         if not found.name.endswith("__main__"):
             yield importlib.import_module(found.name)
 
