@@ -1,6 +1,6 @@
 """The runtimes that artefacts are verified in: a folder per family, and here the list of them.
 
-To add a runtime is to add a folder with a child process that speaks the frames of wire.py and a ``RUNTIMES`` that says
+To add a runtime is to add a folder with a child process that speaks frames (frames.py) and a ``RUNTIMES`` that says
 whether it is here, how its child is started and how it is installed; and its name here. Nothing here imports a runtime:
 ``import tensorflow`` takes seconds, and the question is only whether it is there.
 """

@@ -91,27 +91,27 @@ def _simba(net: Network, x: str) -> str:
     """SimbaV2's ``Actor`` before its tanh. Layers have no bias, and rows of length 1 go from block to block."""
     net.at("embedder")
     x = _of_length_1(net, net.pad(x, ((0, 0), (0, 1)), _SHIFT))
-    x = _of_length_1(net, _scaled(net, net.linear(x, "embedder.w.w", biased=False), "embedder.scaler"))
+    x = _of_length_1(net, _scale_by(net, net.linear(x, "embedder.w.w", biased=False), "embedder.scaler"))
     blocks = net.state.indices("encoder.")
     for index in blocks:
         block = f"encoder.{index}"
-        inner = _scaled(net, net.linear(x, f"{block}.mlp.w1.w", biased=False), f"{block}.mlp.scaler")
+        inner = _scale_by(net, net.linear(x, f"{block}.mlp.w1.w", biased=False), f"{block}.mlp.scaler")
         inner = net.add("Add", [net.add("Relu", [inner]), net.floats(_EPSILON)])
         inner = _of_length_1(net, net.linear(inner, f"{block}.mlp.w2.w", biased=False))
         # forward_scaler = alpha_init / alpha_scale = √width / (blocks + 1); 1 everywhere else
-        step = _scaled(
+        step = _scale_by(
             net,
             net.add("Sub", [inner, x]),
             f"{block}.alpha_scaler",
             math.sqrt(net.width(x)) / (len(blocks) + 1),
         )
         x = _of_length_1(net, net.add("Add", [x, step]))
-    mean = _scaled(net, net.linear(x, "predictor.mean_w1.w", biased=False), "predictor.mean_scaler")
+    mean = _scale_by(net, net.linear(x, "predictor.mean_w1.w", biased=False), "predictor.mean_scaler")
     mean = net.linear(mean, "predictor.mean_w2.w", biased=False)
     return net.add("Add", [mean, net.const(net.state.array("predictor.mean_bias", net.width(mean)), "bias")])
 
 
-def _scaled(net: Network, x: str, module: str, factor: float = 1.0) -> str:
+def _scale_by(net: Network, x: str, module: str, factor: float = 1.0) -> str:
     """``Scaler``: a learned factor for each column, times ``forward_scaler``."""
     net.at(module)
     return net.add("Mul", [x, net.const(net.state.array(f"{module}.scaler", net.width(x)) * factor, "scale")])

@@ -67,13 +67,13 @@ def _page(group: click.Group) -> Iterator[str]:
         yield from (what, f"    {PROGRAM} {typed}", "")
     yield from ("## Exit status", "", *(f"- {n}: {what}" for n, what in STATUSES), "", "## Commands", "")
     for name in group.list_commands(click.get_current_context()):
-        yield from _described(group.commands[name])
+        yield from _describe(group.commands[name])
     yield from ("", "## JSON", "")
     for typed, (file, where) in SCHEMAS.items():
         yield f"- `{typed}`: {where}: {', '.join(_fields(file))}"
 
 
-def _described(made: click.Command) -> Iterator[str]:
+def _describe(made: click.Command) -> Iterator[str]:
     """Its usage and help in a line, then its core options, or all where they are few."""
     context = click.Context(made, parent=click.get_current_context().find_root(), info_name=made.name)
     usage = " ".join(made.collect_usage_pieces(context)).replace("[OPTIONS] ", "")

@@ -6,13 +6,17 @@ The numbers are ratchets: what is left of an older style. They go down with it, 
 from __future__ import annotations
 
 import ast
+import io
 import re
+import subprocess
+import tokenize
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[2]
+ROOMS = ("signatures", "converters", "exporter", "fixtures")
 #: Participles that do not end in -ed.
 IRREGULAR = re.compile(
     "begun|bent|bought|bound|broken|brought|built|caught|chosen|cut|dealt|drawn|driven|fallen|fed|felt|forgotten|"
@@ -30,7 +34,7 @@ IS_NO = 0
 
 
 def trees() -> Iterator[ast.Module]:
-    for room in ("signatures", "converters", "exporter", "fixtures"):
+    for room in ROOMS:
         for path in sorted((ROOT / room).rglob("*.py")):
             if "node_modules" not in path.parts:
                 yield ast.parse(path.read_text(encoding="utf-8"))
@@ -82,3 +86,38 @@ def test_functions_are_verbs_or_what_they_return() -> None:
 def test_messages_say_what_must_be() -> None:
     found = [text for tree in trees() for text in is_no(tree)]
     assert len(found) <= IS_NO, f"say what must be, what is missing or unknown: {found}"
+
+
+#: Another project's file, whose name one of ours had.
+THEIRS = {("converters/formats/barracuda/format.py", "barracuda.py")}
+
+
+def files_named(text: str) -> set[str]:
+    """The modules that docstrings and comments of a module name, with as much of their path as stands there."""
+    nodes = (n for n in ast.walk(ast.parse(text)) if isinstance(n, ast.Module | ast.ClassDef | ast.FunctionDef))
+    words = [ast.get_docstring(n) or "" for n in nodes]
+    words += [t.string for t in tokenize.generate_tokens(io.StringIO(text).readline) if t.type == tokenize.COMMENT]
+    return {name for word in words for name in re.findall(r"[\w/-]*\b\w+\.(?:py|mjs)\b", word)}
+
+
+def test_a_file_is_found_where_it_is_named() -> None:
+    assert files_named('"""As (a/b.py)."""\nx = "c.py"  # of d_e.mjs, f.pyc') == {"a/b.py", "d_e.mjs"}
+
+
+def test_no_docstring_names_a_file_that_is_gone() -> None:
+    """What it names is here, or another project's: never one that this repository had."""
+    said = ["git", "log", "--no-renames", "--diff-filter=D", "--name-only", "--format=", "--", *ROOMS]
+    done = subprocess.run(said, cwd=ROOT, capture_output=True, encoding="utf-8", check=False)
+    gone = set(done.stdout.split())
+    if not gone:
+        pytest.skip("no history here; a whole clone has it: git fetch --unshallow")
+    paths = [p for room in ROOMS for p in (ROOT / room).rglob("*") if p.suffix in (".py", ".mjs")]
+    here = {f"/{p.relative_to(ROOT).as_posix()}" for p in paths if "node_modules" not in p.parts}
+    wrong = [
+        (path, name)
+        for path in sorted(here)
+        if path.endswith(".py")
+        for name in files_named((ROOT / path[1:]).read_text(encoding="utf-8"))
+        if not any(other.endswith(f"/{name}") for other in here) and any(f"/{g}".endswith(f"/{name}") for g in gone)
+    ]
+    assert {(path[1:], name) for path, name in wrong} - THEIRS == set()

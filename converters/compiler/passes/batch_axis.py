@@ -1,8 +1,8 @@
 """A graph whose inputs all have a fixed number of rows, or none, as one that takes any number.
 
 Two readings are tried: the first axes of the inputs, which are equally long, are the agents' and are left free, if rows
-do not change one another then (``row_trial.py``); or the graph decides for one agent, and is computed for each
-(``rows.py``).
+do not change one another then (``vmap_trial.py``); or the graph decides for one agent, and is computed for each
+(``vmap.py``).
 """
 
 from __future__ import annotations

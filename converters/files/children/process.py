@@ -197,7 +197,7 @@ class RuntimeProcess(AbstractContextManager["RuntimeProcess"]):
 
     @contextlib.contextmanager
     def first(self, path: str, size: int) -> Iterator[None]:
-        """What is asked inside has little processor time (patience.py): a model is loaded, or answers once."""
+        """What is asked inside has little processor time (time_limits.py): a model is loaded, or answers once."""
         process = self._process
         before = None if process is None or self._timed_out is None else processor_time(process.pid)
         self._first = None if before is None else (path, before + time_limit(size), time_limit(size))

@@ -2,8 +2,8 @@
 
 torch.onnx.export fixes every length that ``dynamic_axes`` does not name, and what it traced may hold the number of rows
 inside, too. Three readings are tried, and each is held to what it says: the model's own free axis; its fixed number of
-rows, left free (``importer/fixed_batch.py``); the model for one agent, computed for each (``graph/passes/rows.py``).
-What only says that it takes any number is tried (``graph/passes/row_trial.py``).
+rows, left free (``importer/fixed_batch.py``); the model for one agent, computed for each (``compiler/passes/vmap.py``).
+What only says that it takes any number is tried (``compiler/passes/vmap_trial.py``).
 """
 
 from __future__ import annotations

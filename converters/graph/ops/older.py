@@ -141,7 +141,7 @@ def _channels_are_rows(builder: GraphBuilder, image: str, tensor: str) -> bool:
         return False
     free = [i for i, d in enumerate(dims) if isinstance(d, str)]
     if not free:
-        return True  # made for one agent, or so many that only a trial tells (passes/any_number.py)
+        return True  # made for one agent, or so many that only a trial tells (passes/vmap_trial.py)
     behind = math.prod(d for d in dims[free[-1] + 1 :] if isinstance(d, int))
     return shown[2] > 0 and behind % shown[2] == 0
 
