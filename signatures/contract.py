@@ -102,6 +102,10 @@ class Origin(Record, frozen=True):
     normaliser: Text | None = None
 
 
+#: The fields of Origin that are options of reading, and the same in ReadOptions.
+READ_BY = tuple(name for name in Origin.__struct_fields__ if name not in ("path", "sha256", "model"))
+
+
 class CodeSection(TypedDict, total=False):
     """How source code was written, where not as usual.
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from export_model.exporter.cli.console import Console, reporting
-from export_model.exporter.cli.group import PATH, command
+from export_model.exporter.cli.group import command
 from export_model.exporter.cli.options import (
     JUDGING,
     as_given,
@@ -20,6 +20,7 @@ from export_model.exporter.cli.options import (
     reading_candidates,
     understanding,
 )
+from export_model.exporter.cli.rows import PATH
 
 if TYPE_CHECKING:
     from export_model.converters.compiler.options import CompileOptions

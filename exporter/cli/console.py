@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from msgspec import Struct
 
-from export_model.exporter.cli.group import FILE
+from export_model.exporter.cli.rows import FILE
 from export_model.exporter.cli.terminal import Bar, Progress, say, say_json, say_lines, say_paragraph
 from export_model.signatures.errors import ExportModelError, UsageError
 

@@ -9,7 +9,8 @@ from pathlib import Path
 import click
 
 from export_model.exporter.cli.export import export_command
-from export_model.exporter.cli.group import PATH, PROGRAM, command
+from export_model.exporter.cli.group import PROGRAM, command
+from export_model.exporter.cli.rows import PATH
 from export_model.exporter.cli.serve import serve_command
 from export_model.exporter.cli.terminal import say
 

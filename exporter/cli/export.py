@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 import click
 
 from export_model.exporter.cli.console import Console, reporting
-from export_model.exporter.cli.group import PATH, command
+from export_model.exporter.cli.group import command
 from export_model.exporter.cli.options import RULES, as_given, coding, comparing, located, reading, understanding
+from export_model.exporter.cli.rows import PATH
 from export_model.exporter.cli.terminal import say_lines
 
 if TYPE_CHECKING:

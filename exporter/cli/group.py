@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from export_model.exporter import __version__
+from export_model.exporter.cli.rows import CANDIDATE, READING
 from export_model.exporter.cli.terminal import say, say_lines
 from export_model.signatures.errors import UsageError
 
@@ -20,8 +21,6 @@ if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
 
 PROGRAM = "export-model"
-#: What options and arguments take that are paths: of any kind, of a file.
-PATH, FILE = click.Path(path_type=Path), click.Path(path_type=Path, dir_okay=False)
 _OWN = frozenset(("--help", "-h", "--help-all", "--version"))
 #: Commands that ``--help`` leaves to ``--help-all``.
 _RARE = frozenset(("card", "completion", "consumers", "layout", "skill"))
@@ -47,17 +46,8 @@ GROUPS = {
             "files",
         ),
     ),
-    "How to read the source": (
-        *("source", "step", "brain", "inputs", "outputs", "values", "mapped", "sensors", "activation", "script"),
-        *("repair", "normaliser", "interface", "trust_source", "robot", "check"),
-    ),
-    "How to read the candidates": tuple(
-        f"candidate_{name}"
-        for name in (
-            *("step", "brain", "inputs", "outputs", "values", "sensors", "activation", "script", "normaliser"),
-            *("interface", "repair"),
-        )
-    ),
+    "How to read the source": ("source", "mapped", *(row.name for row in READING), "robot", "check"),
+    "How to read the candidates": tuple(f"{CANDIDATE}{row.name}" for row in READING if not row.both),
     "What Unity would say": ("releases", "actions", "brain_parameters"),
     "How to play": ("env", "episodes", "most", "likeliest", "margin", "strict", "partner"),
     "How to verify": (

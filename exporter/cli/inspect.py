@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from export_model.exporter.cli.export import export_command
-from export_model.exporter.cli.group import FILE, PATH, command
+from export_model.exporter.cli.group import command
 from export_model.exporter.cli.options import as_given, reading, understanding
+from export_model.exporter.cli.rows import FILE, PATH
 from export_model.exporter.cli.terminal import say, say_json, say_lines
 from export_model.signatures.errors import ExportModelError, UsageError
 

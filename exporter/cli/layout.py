@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 import click
 from msgspec.structs import replace
 
-from export_model.exporter.cli.group import FILE, PATH, command
+from export_model.exporter.cli.group import command
 from export_model.exporter.cli.options import reading, understanding
+from export_model.exporter.cli.rows import FILE, PATH
 from export_model.exporter.cli.terminal import say, say_json, say_lines, say_paragraph
 from export_model.signatures.errors import UsageError
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Container, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import click
 from click.core import ParameterSource
 
 from export_model.exporter.cli.console import Console
-from export_model.exporter.cli.group import FILE
+from export_model.exporter.cli.rows import CANDIDATE, FILE, READING
 from export_model.signatures.errors import UsageError, suggestion
 
 #: A value that each option of pairs takes.
@@ -75,28 +75,8 @@ def as_given(names: Container[str]) -> list[str]:
 
 #: What decides how a policy is read and judged. A report that says how to compare again has these as they were given.
 JUDGING = frozenset(
-    (
-        *(
-            "mapped",
-            "brain",
-            "inputs",
-            "outputs",
-            "values",
-            "normaliser",
-            "interface",
-            "trust_source",
-            "sensors",
-            "activation",
-            "script",
-            "repair",
-            "source",
-            "step",
-        ),
-        *("golden", "sizes", "tolerances", "atol", "rtol", "required"),
-    )
+    ("mapped", "source", *(row.name for row in READING), "golden", "sizes", "tolerances", "atol", "rtol", "required")
 )
-#: What stands before an option that is for the candidates of a comparison, not for the reference.
-CANDIDATE = "candidate_"
 #: What of it a bundle is verified with that an export was judged by.
 RULES = frozenset(("golden", "sizes", "tolerances", "atol", "rtol", "required"))
 
@@ -128,29 +108,15 @@ located = click.option(
     metavar="WHERE",
     help="auto, full, browser, none, or runtimes by name.",
 )
+_ROWS = {row.name: row for row in READING}
+#: What a format's reader takes.
+_READER = tuple(row.name for row in READING if row.reader)
 #: For sources that only a loader of their own can read, which runs what they say.
-trusting = click.option("--trust-source", is_flag=True, help="Let Keras load what is not plain data; can run code.")
-#: What a source does not say of itself: the name of an option of ``reading``, and the option.
-_READING: Mapping[str, Callable[[Callable[..., Any]], Callable[..., Any]]] = {
-    "step": click.option("--step", type=int, metavar="N", help="The checkpoint of this step (default: the newest)."),
-    "trust_source": trusting,
-    "sensors": click.option("--sensors", metavar="SHAPE,...", help="What the agent of a .pt observes: 8,20x4,3x84x84."),
-    "activation": click.option(
-        "--activation", metavar="NAME", help="Activation between the layers of a bare .pt: elu, tanh, …"
-    ),
-    "script": click.option("--script", metavar="NAME", help="Script that saved a bare .pt: ppo-pytorch-continuous, …"),
-    "repair": click.option("--repair", metavar="NAME", help="Mend a known fault of an ONNX's exporter: gru-reset."),
-    "normaliser": click.option(
-        "--normaliser", type=FILE, metavar="FILE", help="Statistics of a .zip: vecnormalize.pkl, if not next to it."
-    ),
-    "interface": click.option(
-        "--interface", type=FILE, metavar="FILE", help="YAML that states the interface (default: beside), or none."
-    ),
-}
+trusting = _ROWS["trust_source"].option()
 
 
 def reading(*names: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Return a decorator for options of ``_READING`` (none named: all); the command gets a ReadOptions, ``read``.
+    """Return a decorator for options of readers (none named: all); the command gets a ReadOptions, ``read``.
 
     It stands below ``understanding``, which may say that there is no normaliser.
     """
@@ -160,7 +126,7 @@ def reading(*names: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
         def parse_and_call(*args: Any, **rest: Any) -> Any:
             from export_model.converters.formats.source import ReadOptions
 
-            told = {name: rest.pop(name) for name in names or _READING}
+            told = {name: rest.pop(name) for name in names or _READER}
             if "sensors" in told:
                 told["sensors"], told["goals"] = sensors_of(told["sensors"])
             for name in ("normaliser", "interface"):
@@ -168,8 +134,8 @@ def reading(*names: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
             return command(*args, read=ReadOptions(**told), **rest)
 
         made: Callable[..., Any] = parse_and_call
-        for name in names or _READING:
-            made = _READING[name](made)
+        for name in names or _READER:
+            made = _ROWS[name].option()(made)
         return made
 
     return decorate
@@ -214,14 +180,10 @@ def understanding(command: Callable[..., Any]) -> Callable[..., Any]:
         compiling = compile_options(read, write)
         return command(*args, compiling=compiling, **rest)
 
-    for option in (
-        click.option("--brain", metavar="NAME", help="Only this brain of a graph that holds several."),
-        click.option("--input", "inputs", multiple=True, metavar="N=ROLE", help="Say what an input is for."),
-        click.option("--output", "outputs", multiple=True, metavar="N=ROLE", help="Say what an output is."),
-        click.option("--set", "values", multiple=True, metavar="N=VALUE", help="Give a placeholder a fixed value."),
-    ):
-        parse_and_call = option(parse_and_call)
-    return parse_and_call
+    made: Callable[..., Any] = parse_and_call
+    for row in READING:
+        made = made if row.reader else row.option()(made)
+    return made
 
 
 def reading_candidates(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -235,24 +197,16 @@ def reading_candidates(command: Callable[..., Any]) -> Callable[..., Any]:
     def collect(*, read: Any, compiling: Any) -> Any:
         return {"candidate_read": read, "candidate_compiling": compiling}
 
-    options = [o for o in getattr(collect, "__click_params__") if o.name != "trust_source"]  # noqa: B009
+    rows = [row for row in READING if not row.both]
 
     @functools.wraps(command)
     def parse_and_call(*args: Any, trust_source: bool, **rest: Any) -> Any:
-        told = {option.name: rest.pop(f"{CANDIDATE}{option.name}") for option in options}
+        told = {row.name: rest.pop(f"{CANDIDATE}{row.name}") for row in rows}
         return command(*args, trust_source=trust_source, **collect(trust_source=trust_source, **told), **rest)
 
     made: Callable[..., Any] = parse_and_call
-    for option in options:
-        flag = option.opts[0].removeprefix("--")
-        made = click.option(
-            f"--candidate-{flag}",
-            f"{CANDIDATE}{option.name}",
-            type=option.type,
-            multiple=option.multiple,
-            metavar=option.metavar,
-            help=f"--{flag}, for the candidates.",
-        )(made)
+    for row in rows:
+        made = row.option(CANDIDATE)(made)
     return made
 
 

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 import click
 
 from export_model.exporter.cli.console import Console, reporting
-from export_model.exporter.cli.group import PATH, command
+from export_model.exporter.cli.group import command
 from export_model.exporter.cli.options import located, pairs, reading, understanding
+from export_model.exporter.cli.rows import PATH
 
 if TYPE_CHECKING:
     from export_model.converters.compiler.options import CompileOptions

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import click
 
-from export_model.exporter.cli.group import PATH, command
+from export_model.exporter.cli.group import command
 from export_model.exporter.cli.options import one_bundle
+from export_model.exporter.cli.rows import PATH
 from export_model.exporter.cli.terminal import say, say_json, say_lines
 from export_model.signatures.errors import UsageError
 

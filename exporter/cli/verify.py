@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING
 import click
 
 from export_model.exporter.cli.console import Console, reporting
-from export_model.exporter.cli.group import FILE, PATH, command
+from export_model.exporter.cli.group import command
 from export_model.exporter.cli.options import JUDGING, as_given, comparing, located, trusting
+from export_model.exporter.cli.rows import FILE, PATH
 from export_model.exporter.cli.terminal import say_lines
 from export_model.signatures.errors import ExportModelError, RuntimeUnavailableError, UsageError
 from export_model.signatures.fields import printable

@@ -34,7 +34,7 @@ from export_model.exporter.verify.session import Session
 from export_model.exporter.verify.verdict import reference_text
 from export_model.exporter.verify.verification import verify
 from export_model.signatures.code import CodeOptions
-from export_model.signatures.contract import POLICY, Contract
+from export_model.signatures.contract import POLICY, READ_BY, Contract
 from export_model.signatures.errors import BundleError, UsageError, naming
 from export_model.signatures.fields import printable
 from export_model.signatures.roles import Role
@@ -348,20 +348,11 @@ def _source_of(source: Path, contract: Contract, step: int | None, trust_source:
     A run's folder is read at ``step``, by default at the one that the export asked for.
     """
     origin = contract.origin
-    asked = origin.step if step is None else step
-    normaliser = origin.normaliser
-    if normaliser not in (None, NO_NORMALISER):  # a file's name: it is expected beside the source
-        normaliser = str(source.parent / normaliser)
-    read = ReadOptions(
-        asked,
-        origin.sensors,
-        trust_source,
-        origin.goals,
-        origin.activation,
-        normaliser,
-        script=origin.script,
-        repair=origin.repair,
-    )
+    read = ReadOptions(**{name: getattr(origin, name) for name in READ_BY}, trust_source=trust_source)
+    if step is not None:
+        read = replace(read, step=step)
+    if read.normaliser not in (None, NO_NORMALISER):  # a file's name: it is expected beside the source
+        read = replace(read, normaliser=str(source.parent / str(read.normaliser)))
     found = read_source(source, read)
     if found.sha256 != origin.sha256:
         raise BundleError(

@@ -23,7 +23,7 @@ from export_model.exporter import __version__
 from export_model.exporter.export.options import ExportOptions
 from export_model.exporter.export.sources import Source
 from export_model.signatures.code import CodeOptions
-from export_model.signatures.contract import Contract, Origin, parse
+from export_model.signatures.contract import READ_BY, Contract, Origin, parse
 from export_model.signatures.errors import SignatureError, TooLargeError, UsageError, naming
 from export_model.signatures.fields import FieldError, printable
 
@@ -134,14 +134,10 @@ def contract_of(
         path=printable(source.path.name or source.path.absolute().name),  # of the current folder
         sha256=source.sha256,
         model=None if model.name is None else printable(model.name),
-        step=read.step,
-        sensors=read.sensors,
-        goals=read.goals,
-        activation=read.activation,
-        script=read.script,
-        repair=read.repair,
-        normaliser=None if read.normaliser is None else printable(Path(read.normaliser).name),
+        **{name: getattr(read, name) for name in READ_BY},
     )
+    if read.normaliser is not None:
+        origin = replace(origin, normaliser=printable(Path(read.normaliser).name))
     said = None if code is None else code.to_dict() or None
     options = {"profile": profile, "weights": weights, "batch": batch, "code": said, "bake": bake}
     made = {key: value for key, value in options.items() if value is not None}
