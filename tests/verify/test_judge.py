@@ -295,3 +295,53 @@ def test_each_column_of_drawn_numbers_is_compared(column: int, by: float, times:
 
 def _means(policy: Policy, feeds: Feeds) -> Sequence[Array]:
     return [run_graph(policy.graph, dict(feeds), ["deterministic_action"])["deterministic_action"]]
+
+
+# ------------------------------------------------------------------ what a finding says
+
+
+def test_what_is_forgiven_is_counted(tmp_path: Path) -> None:
+    """A log-probability of -∞ is said as -200: never, and nothing else is forgiven."""
+    counts = []
+
+    def never(feeds: Feeds, scores: Array) -> Array:
+        counts.append(int(np.isneginf(scores).sum()))
+        return np.where(np.isneginf(scores), -200, scores).astype(scores.dtype)
+
+    report = judge(branches(0.5), tmp_path, spoiling("action", never), checks=(numbers,))
+    (found,) = (f for f in report.comparisons if f.output == "action")
+    assert report.passed is True and found.smallest_tolerance is None
+    (forgiven,) = found.forgiven
+    assert forgiven.excuse.title == "log-probabilities that say never"
+    assert 0 < forgiven.elements == sum(counts) < found.elements
+
+
+@pytest.mark.parametrize("by", [1e-3, 0.0])
+def test_a_failure_alone_says_what_tolerance_would_do(by: float, tmp_path: Path) -> None:
+    shifted = spoiling("action", lambda f, a: a + np.float32(by))
+    report = judge(compiled(continuous_policy()), tmp_path, shifted, checks=(numbers,))
+    (found,) = (f for f in report.comparisons if f.output == "action")
+    assert (found.smallest_tolerance is None) == (by == 0)
+
+
+def test_nan_beside_a_number_is_explained_or_a_fault(tmp_path: Path) -> None:
+    """Where a sigmoid that is taken for zero makes NaN nothing is verified; where none is near zero it is a fault."""
+    policy = logarithms()
+
+    def logs_of(feeds: Feeds) -> Array:
+        return run_graph(policy.graph, dict(feeds), ["logarithm"])["logarithm"]
+
+    def explained(feeds: Feeds, action: Array) -> Array:
+        logs = logs_of(feeds)
+        taken = {**feeds, "logarithm": np.where(logs < -17, -np.inf, logs).astype(np.float32)}
+        made = run_graph(policy.graph, taken, ["action"])["action"]
+        return np.where(np.isnan(made), made, action)
+
+    def unexplained(feeds: Feeds, action: Array) -> Array:
+        far = np.abs(feeds["state"]).max(axis=1, initial=0) > 8
+        return np.where((far & (logs_of(feeds) > -17).all(axis=1))[:, None], np.float32(np.nan), action)
+
+    report = judge(policy, tmp_path, spoiling("action", explained), checks=(numbers,))
+    assert report.passed is None, [f.explanation() for f in report.failures]
+    assert "NaN or infinity beside a number" in report.undecided
+    assert wrong(judge(policy, tmp_path, spoiling("action", unexplained), checks=(numbers,))) == {("numbers", "action")}
