@@ -90,6 +90,9 @@ INPUT_PATTERNS: tuple[tuple[re.Pattern[str], Role, tuple[int, ...] | None, str],
     # PyTorch's own is input.1
     (re.compile(r"(actor_)?obs|observations?|inputs?(\.\d+)?"), Role.VECTOR, (2,), "trainers on PyTorch"),
     (re.compile(r"(actor_)?obs|observations?|inputs?(\.\d+)?"), Role.VISUAL, (4,), "trainers on PyTorch"),
+    # lerobot 0.4 (utils/constants.py: OBS_STATE, OBS_ENV_STATE, OBS_IMAGE, OBS_IMAGES)
+    (re.compile(r"observation\.(environment_)?state"), Role.VECTOR, (2, 3), "LeRobot"),
+    (re.compile(r"observation\.images?(\..+)?"), Role.VISUAL, (4,), "LeRobot"),
     (re.compile(r"epsilon(_\d+)?"), Role.NOISE, None, "ML-Agents 0.1 to 0.23"),
     (re.compile(r"action_masks"), Role.MASKS, (2,), "ML-Agents"),
     (re.compile(r"prev_action"), Role.PREV_ACTION, (1, 2), "ML-Agents"),

@@ -23,6 +23,19 @@ def _has_mark(at: int, marks: Sequence[bytes], file: Content) -> bool:
     return any(file.head[at : at + len(mark)] == mark for mark in marks)
 
 
+#: What is to be done with weights whose network is in the code of a library.
+_NETWORK = "load it in its library, export the policy there (torch.onnx.export), and give the .onnx"
+
+
+def _is_safetensors(file: Content) -> bool:
+    """Whether it begins with the length of a JSON header, eight bytes, and that header."""
+    return file.head[8:10] == b'{"' and 2 <= int.from_bytes(file.head[:8], "little") <= _MOST_HEADER
+
+
+#: The longest header that safetensors reads (100 MB).
+_MOST_HEADER = 100_000_000
+
+
 #: Key, name, advice, where the mark stands, and the marks.
 _OTHERS: tuple[tuple[str, str, str, int, *tuple[bytes, ...]], ...] = (
     ("png", "a PNG picture", _NOT_A_MODEL, 0, b"\x89PNG\r\n"),
@@ -74,6 +87,12 @@ REFUSED = (
             sniff=partial(_has_mark, at, marks),
         )
         for key, label, advice, at, *marks in _OTHERS
+    ),
+    Format(
+        key="safetensors",
+        label="weights without their network (safetensors), as LeRobot and other libraries save them",
+        advice=_NETWORK,
+        sniff=_is_safetensors,
     ),
     *(Format(key=k.key, label=k.label, advice=k.advice, sniff=partial(is_kind, k)) for k in KINDS),
     Format(
@@ -151,6 +170,8 @@ def _nothing_in(folder: Path) -> SourceError:
             "it is a checkpoint of RLlib without rl_module/<name>/module_state.pkl (the old API stack, or another "
             "framework): load it there, export its module (torch.onnx.export), and give the .onnx"
         )
+    elif {"config.json", "model.safetensors"} <= {*inside}:
+        fix = f"it is a policy of LeRobot or a model of another library, weights without their network: {_NETWORK}"
     else:
         fix = "give a run's folder (models/<run>, results/<run>), a SavedModel, a TensorFlow.js model, or a model file"
     return SourceError(

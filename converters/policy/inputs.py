@@ -200,7 +200,7 @@ class _Inputs:
 
     def _ambiguous_error(self, nodes: Sequence[Node]) -> SignatureError:
         name = nodes[0].name
-        roles = [f"--input {name}={r}" for r in ("masks", "vector_observation", "parameter")]
+        roles = [f"--input {name}={r}" for r in ("vector_observation", "masks", "parameter")]
         known = ", ".join(roles[placeholder_rank(nodes[0]) != 2 :])
         shown = ", ".join(f"{n.name} {_shape_text(n)}" for n in nodes)
         return SignatureError(

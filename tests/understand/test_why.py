@@ -106,7 +106,8 @@ def test_every_rule_on_names_decides() -> None:
     counted = (Role.PREV_ACTION, Role.SEQUENCE_LENGTH, Role.BATCH_SIZE)
     said = set()
     for name in ("state", "vector_observation", "obs_0", "visual_observation", "entities_0", "obs", "epsilon",
-                 "action_masks", "prev_action", "memories", "sequence_length_1", "batch_size"):  # fmt: skip
+                 "action_masks", "prev_action", "memories", "sequence_length_1", "batch_size",
+                 "observation.state", "observation.images.top"):  # fmt: skip
         for rule in BY_NAME:
             role = Role(rule.role)
             shape = (None,) if role in counted else dims.get(role, dims[None])
