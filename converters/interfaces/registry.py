@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import Any
 
 from msgspec import Struct
 
@@ -43,16 +44,37 @@ class InterfaceFile(Struct, frozen=True):
     read: Callable[[Table, str, str], Interface]
     #: whether it is for several behaviors, each of which may have a folder below its own
     of_many: bool = False
+    #: whether it is of this kind by what it holds, where others have the same keys; it may have any name then
+    fits: Callable[[Mapping[str, Any]], bool] = lambda content: True
 
 
 def _alone(read: Callable[[Table], Interface]) -> Callable[[Table, str, str], Interface]:
     return lambda table, model, behavior: read(table)
 
 
+def _parts(content: Mapping[str, Any]) -> list[Any]:
+    """What stands below ``observations`` and ``actions``."""
+    tables = [content[key] for key in _BOTH if isinstance(content.get(key), dict)]
+    return [value for table in tables for value in table.values()]
+
+
+def _has_rows(content: Mapping[str, Any]) -> bool:
+    """Whether its terms are lists of rows, as IO descriptors have them."""
+    return isinstance(content.get("actions"), list) or any(isinstance(part, list) for part in _parts(content))
+
+
+def _has_scales(content: Mapping[str, Any]) -> bool:
+    """Whether its terms are tables with scales right below ``observations`` and ``actions``, none with a function."""
+    entries = [part for part in _parts(content) if isinstance(part, dict)]
+    return any("scale" in part for part in entries) and "decimation" not in content
+
+
 FILES = (
-    InterfaceFile("Isaac Lab's IO descriptors", "*IO_descriptors.yaml", _BOTH, _alone(read_descriptors)),
+    InterfaceFile(
+        "Isaac Lab's IO descriptors", "*IO_descriptors.yaml", _BOTH, _alone(read_descriptors), fits=_has_rows
+    ),
     InterfaceFile("LEAPP's pipeline", "{folder}.yaml", ("models",), lambda t, model, _: read_pipeline(t, model)),
-    InterfaceFile("Unitree's deploy.yaml", "deploy.yaml", _BOTH, _alone(read_deploy)),
+    InterfaceFile("Unitree's deploy.yaml", "deploy.yaml", _BOTH, _alone(read_deploy), fits=_has_scales),
     InterfaceFile("Isaac Lab's env.yaml", "env.yaml", ("decimation", *_BOTH), _alone(read_environment)),
     InterfaceFile("Isaac Lab's agent.yaml", "agent.yaml", ("clip_actions", "params"), _alone(read_agent)),
     InterfaceFile(
@@ -133,7 +155,8 @@ def read_interface(path: Path, model: str, behavior: str) -> Interface:
     content = read_yaml(read_bytes(path, empty=True, most=MAX_YAML_BYTES), path.name)
     own = [k for k in FILES if fnmatchcase(path.name, k.pattern.replace("{folder}", path.absolute().parent.name))]
     for kind in [*own, *(k for k in FILES if k not in own)]:
-        if isinstance(content, dict) and any(key in content for key in kind.keys):
+        by_content = kind in own or (isinstance(content, dict) and kind.fits(content))
+        if isinstance(content, dict) and by_content and any(key in content for key in kind.keys):
             return kind.read(Table(content, printable(path.name)), model, behavior)
     known = ", ".join(kind.label for kind in FILES)
     raise DamagedFileError(

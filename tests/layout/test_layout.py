@@ -256,3 +256,25 @@ def test_a_second_of_the_processor_is_enough() -> None:
         rank_layouts(trial, plausible_layouts(trial.width, trial.actions))
         rounds.append(time.process_time() - start)
     assert min(rounds) < 1
+
+
+def test_a_deploy_yaml_of_any_name_is_one(tmp_path: Path) -> None:
+    """Unitree's file states joints by numbers in the robot's own order; under another name it was read as rows."""
+    pytest.importorskip("yaml")
+    sizes = {
+        "base_ang_vel": 3,
+        "projected_gravity": 3,
+        "velocity_commands": 3,
+        "joint_pos_rel": 12,
+        "joint_vel_rel": 12,
+    }
+    terms = {name: {"scale": [1.0] * size, "history_length": 1} for name, size in (*sizes.items(), ("last_action", 12))}
+    places = [0, 3, 6, 9, 1, 4, 7, 10, 2, 5, 8, 11]
+    right = {"joint_ids_map": places, "observations": terms, "actions": {"JointPositionAction": {"scale": [0.25] * 12}}}
+    for name in ("deploy.yaml", "mine.yaml"):
+        (tmp_path / name).write_text(json.dumps(right))
+        assert export_model("layout", FOLDER / "walker.pt", "--check", tmp_path / name).status == 0
+    (tmp_path / "mine.yaml").write_text(json.dumps({**right, "joint_ids_map": list(range(12))}))
+    ran = export_model("layout", FOLDER / "walker.pt", "--robot", "go2", "--check", tmp_path / "mine.yaml")
+    assert ran.status == 1
+    assert "the joints seem to stand level by level" in ran.out
