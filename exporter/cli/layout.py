@@ -69,7 +69,7 @@ def layout_command(
         raise UsageError(
             f"{check} states no layout that can be tried",
             why="it needs the order of terms that are known, with as many numbers as the policy takes, and the joints",
-            fix="name the robot, --robot; docs/layout.md lists the terms",
+            fix="name the robot: --robot NAME",
         )
     if write is not None:
         write_layout(told, write)
