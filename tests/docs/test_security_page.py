@@ -6,7 +6,16 @@ import re
 
 import pytest
 
+from export_model.converters.compiler.options import MAX_PORTS
+from export_model.converters.compiler.passes.unroll import MAX_POLICY_NODES
+from export_model.converters.files.fetch import MAX_BYTES, MAX_WEIGHTS
+from export_model.converters.files.message_limits import MAX_FIELDS
+from export_model.converters.files.tensorflow_messages import MAX_GRAPHDEF_NODES
+from export_model.signatures.bounded import MAX_VALUES
 from tests.commands import ROOT
+from tests.hostile import zoo
+from tests.hostile.test_files_in_place_of_weights import CASES as SOURCES
+from tests.hostile.test_files_in_place_of_weights import ODD
 from tests.runtimes.test_confinement import ATTEMPTS
 
 PAGE = (ROOT / "docs/security.md").read_text(encoding="utf-8")
@@ -55,6 +64,17 @@ def test_a_probe_is_there_and_asked_for(name: str) -> None:
 
 def test_the_page_counts_the_attempts() -> None:
     assert f"| {len(ATTEMPTS)} attempts, by each kind of child |" in PAGE
+    assert f"| {len(zoo.CASES)} cases |" in PAGE
+    assert f"| {len(ODD)} kinds, {len(ODD) * len(SOURCES)} files |" in PAGE
+
+
+def test_the_page_says_the_limits() -> None:
+    text = " ".join(PAGE.split())
+    assert f"a graph of {MAX_GRAPHDEF_NODES:,} nodes, a policy of {MAX_POLICY_NODES:,}, {MAX_PORTS:,} inputs or" in text
+    assert (MAX_BYTES + 1, MAX_WEIGHTS) == (2 << 30, 16 << 30)
+    assert "a file of 2 GiB, 16 GiB of external weights" in text
+    assert (MAX_FIELDS, MAX_VALUES) == (3 << 20, 1 << 22)
+    assert "protobuf files (3 << 20) and the values of JSON (1 << 22) are counted" in text
 
 
 def test_what_was_tried_is_kept_somewhere() -> None:

@@ -16,4 +16,8 @@ def test_ci_checks_every_python_that_is_promised() -> None:
     assert re.findall(r'"([^"]+)"', matrix) == promised
     assert len(promised) > 1
     assert "make check PYTHON=python" in workflow
-    assert f"You need Python {promised[0]} to {promised[-1]}" in (ROOT / "CONTRIBUTING.md").read_text()
+    tested, most = f"Python {promised[0]} to {promised[-1]}", project["requires-python"].partition("<")[2]
+    assert f"You need {tested}" in (ROOT / "CONTRIBUTING.md").read_text()
+    newest = f"3.{int(most.removeprefix('3.')) - 1}"
+    assert f"{tested} with `venv`" in (readme := (ROOT / "README.md").read_text())
+    assert newest == promised[-1] or f"pip installs it on {newest}, too" in readme
