@@ -103,7 +103,7 @@ class Jitter:
         quarter of a unit, so the total is about ε/4·√n·‖terms‖. The kernel itself, run on squares, gives ‖terms‖².
         An operand that was not moved would have moved each term by about a unit of its own.
         """
-        if any(r.dtype.kind != "f" for r in results):
+        if any(r.dtype.kind != "f" for r in results) or entry.layer == "pool":  # whose terms were moved as operands
             return results
         if not entry.layer:
             # of a mean the squares are a mean, too

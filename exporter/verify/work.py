@@ -87,7 +87,7 @@ def products(graph: Graph) -> int:
             continue
         result = _elements(types[ref(node.name, 0)])
         terms = 1.0
-        if traits(node).layer and traits(node).precision == "summed":
+        if traits(node).layer in ("dense", "convolution"):
             kernel, shape = types[node.inputs[1]], types[ref(node.name, 0)].shape
             width = shape[-1] if shape and isinstance(shape[-1], int) else 1
             terms = _elements(kernel) / max(1, width)

@@ -355,6 +355,7 @@ OPS = (
         nn=nn.pool(LayerType.AVG_POOL2D),
         litert=pool("AVERAGE_POOL_2D"),
         loops=loops.pool("sum"),
+        precision="summed",
         layer="pool",
     ),
     *(
