@@ -240,7 +240,8 @@ def test_rounding_moves_no_function_out_of_its_range(arithmetic: str) -> None:
     feeds = {"x": np.array([[30.0, -30, 9, -8.5]], np.float32)}
     for seed in range(50):
         found = run_graph(Graph(tuple(nodes)), feeds, ["tanh", "softmax"], Jitter(seed, arithmetic))
-        assert np.abs(found["tanh"]).max() <= 1 + 2**-23
+        assert np.abs(found["tanh"]).max() <= 1 + 2**-22  # onnxruntime's own, of 8.4755
+        assert (1 - found["tanh"] ** 2 + np.float32(1e-6) > 0).all()
         assert found["softmax"].min() >= 0 and found["softmax"].max() <= 1 + 2**-23
 
 

@@ -61,12 +61,13 @@ _PHONE = {
 }
 #: OpenVINO 2026.4, which makes the code of a model's functions itself, where it is worse.
 _COMPILED = {"Elu": (1, 1.1e-7), "Erf": (5, 4.6e-7), "Exp": (3, TINY), "Expm1": (4, 2e-7), "Softplus": (7, 2e-6)}
-#: Two units in the last place above 1: onnxruntime 1.31's tanh gives that of 8.4755, Eigen's in TensorFlow 1.4 one.
-_ONE = 1 + 2.0**-22
+#: One unit in the last place above 1, and two: onnxruntime 1.31's tanh of 8.4755; Eigen's in TensorFlow 1.4 gives one.
+_ONE, _TANH = 1 + 2.0**-23, 1 + 2.0**-22
 #: What no runtime's function goes beyond, however it approximates it (measured there, too): log(1 - tanh(x)² + 1e-6) of
 #: a number farther above 1 would be no number.
 RANGES: Mapping[str, tuple[float, float]] = {
-    **dict.fromkeys(("Cos", "Erf", "Sin", "Tanh"), (-_ONE, _ONE)),
+    **dict.fromkeys(("Cos", "Erf", "Sin"), (-_ONE, _ONE)),
+    "Tanh": (-_TANH, _TANH),
     **dict.fromkeys(("Sigmoid", "Softmax"), (0.0, _ONE)),
     "Exp": (0.0, float("inf")),
 }
