@@ -68,7 +68,7 @@ class Runtimes:
         self.need("tensorflow")
         path = self._folder / f"{next(self._numbers)}.pb"
         path.write_bytes(schema.serialise(message))
-        model = self._pool.process("tensorflow").load(str(path), kind="bytes")
+        model = self._pool.process("tensorflow").load(str(path), kind="graph")
         results = model.run(dict(feeds), list(fetches))
         model.unload()
         return [results[name] for name in fetches]
