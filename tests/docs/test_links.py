@@ -71,3 +71,9 @@ def test_the_messages_of_the_faq_are_ones_that_are_said() -> None:
     asked = re.findall(r"^## `(.*)`$", (ROOT / "docs/faq.md").read_text(encoding="utf-8"), re.MULTILINE)
     assert len(asked) > 8
     assert [message for message in asked if message not in code] == []
+
+
+@pytest.mark.parametrize("page", [*pages(), ROOT / "CONTRIBUTING.md"], ids=name_of)
+def test_no_page_was_left_between_two_versions(page: Path) -> None:
+    """A merge that was not finished leaves lines of its own in the text."""
+    assert not re.findall(r"^(?:<{7}|>{7}|={7})(?: .*)?$", page.read_text(encoding="utf-8"), re.MULTILINE)
