@@ -211,14 +211,15 @@ class Session:
         try:
             for i, array in enumerate(fed.values()):
                 given[i] = self._tensor(array)
-            with _status(self._library) as status:
-                self._library.TF_SessionRun(
-                    *(self._session, None),
-                    *(inputs, given, len(fed)),
-                    *(outputs, made, len(asked)),
-                    *(None, 0),
-                    *(None, status),
-                )
+            if asked:  # nor does it run for nothing
+                with _status(self._library) as status:
+                    self._library.TF_SessionRun(
+                        *(self._session, None),
+                        *(inputs, given, len(fed)),
+                        *(outputs, made, len(asked)),
+                        *(None, 0),
+                        *(None, status),
+                    )
             answers = {name: self._array(tensor) for name, tensor in zip(asked, made, strict=True)}
             return {name: answers[name] if name in answers else fed[_tensor_name(name)] for name in fetch}
         finally:
