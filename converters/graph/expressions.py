@@ -126,7 +126,7 @@ class Expressions:
             text = self._counters[id(x)]
             return f"({text})" if " " in text else text
         if isinstance(x, Reduced):
-            words[id(x)] = self._reduced(x, words, shared)
+            words[id(x)] = self._reduction(x, words, shared)
             return words[id(x)]
         if isinstance(x, Drawn):
             self.draws = True
@@ -177,7 +177,7 @@ class Expressions:
         info = np.iinfo(kind)
         return self.language.literal(info.min if largest else info.max, kind)
 
-    def _kept(self, x: Reduced, text: str, values: Sequence[str], apart: str = "") -> str:
+    def _accumulation(self, x: Reduced, text: str, values: Sequence[str], apart: str = "") -> str:
         """What is kept, and values added to it one after the other, or the largest or smallest; ``apart``: between."""
         function = {"sum": "add", "product": "mul"}.get(x.kind, x.kind)
         if x.body.dtype == BOOL:
@@ -188,13 +188,13 @@ class Expressions:
 
     def _keep_all(self, x: Reduced, name: str, values: Sequence[str]) -> None:
         """Add values to what is kept, one after the other, or keep the largest or smallest."""
-        text = bare(self._kept(x, name, values))
+        text = bare(self._accumulation(x, name, values))
         if text == f"{name} + {values[0]}":
             self._say(f"{name} += {bare(values[0])};")
         else:
             self._say(f"{name} = {text};")
 
-    def _reduced(self, x: Reduced, words: dict[int, str], shared: dict[int, int]) -> str:
+    def _reduction(self, x: Reduced, words: dict[int, str], shared: dict[int, int]) -> str:
         first, language = x.kind.startswith("first"), self.language
         before, depth = dict(self._counters), self._depth
         result = self._locals.fresh("found" if first else KEPT[x.kind])

@@ -163,7 +163,7 @@ class Printer(Expressions):
             self._counters[id(last)] = base
             values.append(self._text(summed.body, words, shared))
         name, line = self._place(stage.result, stage.at, {}, {}), "\n" + "    " * (self._depth + 1)
-        self._say(f"{name} = {bare(self._kept(summed, start or name, values, line))};")
+        self._say(f"{name} = {bare(self._accumulation(summed, start or name, values, line))};")
         self._close()
 
     def _open_row(self, counter: Counter) -> None:

@@ -22,14 +22,14 @@ class Change(Struct, frozen=True):
 def changes_of(layout: Layout) -> Iterator[tuple[Change, Mirrors]]:
     """Yield every small change with the mirrors of the layout that it leads to, each pair of mirrors once."""
     seen = {layout.mirrors()}
-    for change, joints, turned in (*_exchanged(layout), *_turned(layout), *_terms(layout)):
+    for change, joints, turned in (*_exchanges(layout), *_turns(layout), *_terms(layout)):
         mirrors = layout.mirrors_with(joints, turned)
         if mirrors not in seen:
             seen.add(mirrors)
             yield change, mirrors
 
 
-def _exchanged(layout: Layout) -> Iterator[tuple[Change, Mirror, str]]:
+def _exchanges(layout: Layout) -> Iterator[tuple[Change, Mirror, str]]:
     """Two joints of one side in each other's place: each then mirrors as the joint that is really there."""
     robot, joints = layout.robot, layout.joints
     index = {joint: i for i, joint in enumerate(joints)}
@@ -50,7 +50,7 @@ def _exchanged(layout: Layout) -> Iterator[tuple[Change, Mirror, str]]:
             )
 
 
-def _turned(layout: Layout) -> Iterator[tuple[Change, Mirror, str]]:
+def _turns(layout: Layout) -> Iterator[tuple[Change, Mirror, str]]:
     """One joint of a pair about the other direction than is known of the robot."""
     own = mirror_of_joints(layout.robot, layout.joints)
     for i, joint in enumerate(layout.joints):

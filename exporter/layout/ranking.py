@@ -3,7 +3,7 @@
 A class is decided where its score is low, lower than that of every other class and of orders of joints by chance by a
 margin, and where no small change of it fits better.
 
-How the bounds were chosen: of 34 public policies of 16 robots the true class is first in all, 27 are decided. Without
+How the bounds were chosen: of 34 public policies the true class is first in all, 27 are decided. Without
 their class, or their robot, none is decided; with ``BETTER`` at 0.8 one is, with two terms exchanged. Of 200 random
 networks the best score is 0.82, and 0.91 of the next; of 68 public policies with rows and columns in random order 0.85.
 tests/layout holds the project's own walkers to them.

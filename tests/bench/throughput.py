@@ -226,10 +226,8 @@ def write(found: Sequence[Measured], command: str, where: str) -> None:
     ]
     PLOT.write_text(plot(lines, "processes (--jobs)", "policies a second"), encoding="utf-8")
     table = "\n".join([HEAD, *map(row, found)])
-    memory = "".join(f"- {text}\n" for each in found for text in memory_of(each))
     section = (
-        f"{BEGIN}\n{where}. `{command}`\n\n{table}\n\nResident memory on the way:\n\n{memory}\n"
-        f"![Policies a second against jobs](pictures/{PLOT.name})\n\n{END}"
+        f"{BEGIN}\n{where}. `{command}`\n\n{table}\n\n![Policies a second against jobs](pictures/{PLOT.name})\n\n{END}"
     )
     text = PAGE.read_text(encoding="utf-8")
     before, _, rest = text.partition(BEGIN)

@@ -10,6 +10,7 @@ model for one agent, and is run with several.
 
 from __future__ import annotations
 
+import re
 import tempfile
 import warnings
 from collections import Counter
@@ -217,7 +218,7 @@ def _fault(test: NodeTest, fed: Sequence[int], policy: Policy, folder: Path, poo
 def _short(error: ExportModelError) -> str:
     """The reason without the names of a test's nodes."""
     text = error.what.split(" (also: ")[0]
-    reason = text.partition("): ")[2] or text
+    reason = re.sub(r" \(node '[^']*'\)", "", text.partition("): ")[2] or text)
     return reason if "no entry of the table" not in reason else "not in the table"
 
 
@@ -231,7 +232,7 @@ def page(outcomes: Sequence[tuple[NodeTest, Outcome]]) -> str:
     right = {t.subject.partition(",")[0] for t, o in outcomes if o.state == "right"}
     for test, found in outcomes:
         if found.state == "refused":
-            reasons = refused.setdefault(test.subject, {})
+            reasons = refused.setdefault(test.subject.partition(",")[0], {})
             reasons[found.reason] = reasons.get(found.reason, 0) + 1
     lines = [
         "# Operators of ONNX",
@@ -255,9 +256,7 @@ def page(outcomes: Sequence[tuple[NodeTest, Outcome]]) -> str:
             by_reason.setdefault(reason, Counter())[kind] += count
     for reason, kinds in sorted(by_reason.items(), key=lambda item: (-item[1].total(), item[0])):
         lines.append(f"| {reason} | {', '.join(f'{kind} {count}' for kind, count in sorted(kinds.items()))} |")
-    return "\n".join(
-        [*lines, "", "`python -m tests.onnx_reader.node_tests` writes this page; a test holds a part of it.", ""]
-    )
+    return "\n".join([*lines, ""])
 
 
 def main() -> None:

@@ -23,4 +23,5 @@ def test_what_is_converted_is_right_and_what_is_refused_stands_on_the_page(tmp_p
         assert found.state != "wrong", (test.name, found.reason)
         if found.state == "refused":
             rows = [line for line in page.splitlines() if line.startswith(f"| {found.reason} | ")]
-            assert any(re.search(rf"[|,] {re.escape(test.subject)} \d", row) for row in rows), test.name
+            operator = test.subject.partition(",")[0]
+            assert any(re.search(rf"[|,] {operator} \d", row) for row in rows), test.name
