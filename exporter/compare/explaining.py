@@ -94,8 +94,7 @@ def _shared_actions(trial: Trial, participant: Participant) -> dict[str, str]:
 def _explanations(trial: Trial, participant: Participant, heads: Mapping[str, str]) -> Iterator[str]:
     signature, label = trial.signature, participant.name
     pair = signature.recurrence
-    memories = [s.name for s in signature.inputs if s.role is Role.MEMORY_IN]
-    if memories != list(pair[:1] if pair else ()) or (pair is not None and pair[1] not in participant.outputs):
+    if pair is not None and pair[1] not in participant.outputs:
         return
     steps = draw_rollout(signature, seed=trial.options.seed, steps=_STEPS, batch=_EPISODES)
     for feeds in steps:  # without chance
