@@ -44,6 +44,7 @@ def chosen_runtimes(
         "auto": automatic,
         "browser": [n for n in known if n in _IN_BROWSERS],
         "full": [n for n in known if known[n].supported and n in useful and n not in _BY_NAME],
+        "js": ["node"],  # what --to calls the module that it runs
     }
     words = [word for word in wanted.split(",") if word] if isinstance(wanted, str) else wanted
     names = [name for word in words for name in several.get(word, (word,))]

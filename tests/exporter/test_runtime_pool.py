@@ -77,6 +77,7 @@ def test_words_stand_for_several_and_may_be_combined(monkeypatch: pytest.MonkeyP
     )  # they run none of these, or are asked by name alone
     assert {"c", "litert"} <= set(names("full", "c", "litert"))
     assert "openvino" in names("full,openvino")
+    assert names("js") == names("node"), "the judge of --to js answers to its name"
 
 
 @pytest.mark.parametrize("wanted", ["tfjs-wasm,onnxruntime", ["tfjs-wasm", "onnxruntime"], "tfjs-wasm,,onnxruntime,"])
