@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from export_model.converters.graph.nodes import Graph, node_of
+from export_model.converters.graph.ops.table import hands_on
 from export_model.converters.graph.run import run_graph
 from export_model.converters.layouts.layouts import Mirrors
 from export_model.converters.policy.policy import Policy
@@ -106,23 +107,25 @@ def statistics_of(policy: Policy, vector: TensorSpec) -> tuple[np.ndarray | None
         mean, std = (np.broadcast_to(np.asarray(said[k], float), vector.shape[-1] or 1) for k in ("mean", "std"))
         return mean, std
     graph, name = policy.graph, policy.feeds[vector.name]
-    found: dict[str, np.ndarray] = {}
+    mean = spread = None
     readers = graph.consumers()
-    while len(readers[name]) == 1 and (node := readers[name][0]).op in _NORMALISING:
-        if len(node.inputs) > 1:
+    while len(readers[name]) == 1:
+        node = readers[name][0]
+        if not hands_on(node):
             value = _other(graph, node.inputs, name)
             if value is None or value.size != vector.shape[-1] or node_of(node.inputs[0]) != name:
                 break
-            found[node.op] = value.reshape(-1).astype(float)
+            value = value.reshape(-1).astype(float)
+            if node.op == "Sub":
+                mean = value
+            elif node.op == "RealDiv":
+                spread = value
+            elif node.op == "Mul":
+                spread = 1 / np.where(value == 0, 1, value)
+            else:
+                break
         name = node.name
-    spread = found.get("RealDiv")
-    if spread is None and "Mul" in found:
-        spread = 1 / np.where(found["Mul"] == 0, 1, found["Mul"])
-    return (found.get("Sub"), spread) if "Sub" in found and spread is not None else (None, None)
-
-
-#: What stands between an observation and the first layer where it is normalised.
-_NORMALISING = ("Sub", "RealDiv", "Mul", "Identity")
+    return (mean, spread) if mean is not None and spread is not None else (None, None)
 
 
 def _other(graph: Graph, inputs: Sequence[str], name: str) -> np.ndarray | None:
