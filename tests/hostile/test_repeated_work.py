@@ -103,7 +103,7 @@ def test_outputs_of_one_name_have_an_end(tmp_path: Path) -> None:
 
 
 def test_more_calls_of_layers_than_any_policy_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("export_model.converters.formats.keras.network.MAX_NODES", 2)
+    monkeypatch.setattr("export_model.converters.formats.keras.network.MAX_POLICY_NODES", 2)
     model = activations([0, 1, 2], ["a", "b", "c"], [["c", 0, 0]])
     with pytest.raises(NotAPolicyError, match="called 3 times"):
         read_source(written(model, tmp_path / "m")).policies()
@@ -111,7 +111,7 @@ def test_more_calls_of_layers_than_any_policy_has(tmp_path: Path, monkeypatch: p
 
 def test_more_layers_than_any_policy_has_are_not_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A million of them took a minute before their calls were counted."""
-    monkeypatch.setattr("export_model.converters.formats.keras.model.MAX_NODES", 2)
+    monkeypatch.setattr("export_model.converters.formats.keras.model.MAX_POLICY_NODES", 2)
     with pytest.raises(NotAPolicyError, match="3 layers"):
         read_source(written(activations([0, 1], ["a", "b"], [["b", 0, 0]]), tmp_path / "m")).policies()
 
