@@ -8,15 +8,14 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from export_model.converters.runtimes.pool import RuntimePool
-from export_model.exporter.export import pipeline
+from export_model.converters.runtimes import pool as pools
 
 
 @contextlib.contextmanager
 def shared_runtimes() -> Iterator[None]:
     """All exports of this process use the same processes of the runtimes."""
-    with RuntimePool() as pool:
-        pipeline.RuntimePool = lambda: contextlib.nullcontext(pool)  # type: ignore[assignment,misc]
+    with pools.RuntimePool() as pool:
+        pools.RuntimePool = lambda: contextlib.nullcontext(pool)  # type: ignore[assignment,misc]
         yield
 
 

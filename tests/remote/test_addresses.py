@@ -151,7 +151,7 @@ def test_a_folder_is_one_source_and_errors_name_the_address(memory: Any) -> None
 
 
 def test_more_than_is_fetched_is_refused(memory: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fetching, "MAX_BYTES", 1000)
+    monkeypatch.setattr(fetching, "MAX_REMOTE_BYTES", 1000)
     with pytest.raises(SourceError, match="has more than"), nearby(Path("memory://runs/a/discrete.bytes")):
         pass
     monkeypatch.setattr(fetching, "MAX_FILES", 1)

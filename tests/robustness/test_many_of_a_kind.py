@@ -53,7 +53,7 @@ def test_more_nodes_than_any_file_has_are_refused(
     make: Callable[[Path], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = make(tmp_path)
-    monkeypatch.setattr(schema, "MAX_NODES", MANY - 1)
+    monkeypatch.setattr(schema, "MAX_GRAPHDEF_NODES", MANY - 1)
     with pytest.raises(NotAPolicyError, match=f"no more than {MANY - 1} are read"):
         read_source(path)
 
