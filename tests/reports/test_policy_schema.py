@@ -44,7 +44,7 @@ def test_every_field_of_a_record_is_a_member() -> None:
         (("$defs", "Memory", "required"), ["size", "input", "output", "layout"]),
         (("$defs", "Origin", "required"), ["path", "sha256"]),
         (("$defs", "Origin", "properties", "model"), {"type": "string", "maxLength": 4000}),
-        (("$defs", "Code", "properties", "math"), {"const": "own"}),
+        (("$defs", "CodeSection", "properties", "math"), {"const": "own"}),
         (("$defs", "Integer", "properties", "kind"), {"const": "integer"}),
         (("$defs", "Tool", "required"), ["name", "version"]),
         (("properties", "action_space"), {"type": "string", "enum": ["continuous", "discrete", "hybrid"]}),

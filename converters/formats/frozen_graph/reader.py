@@ -40,6 +40,9 @@ def from_graph_def(graph_def: Any, detached: Detached | None = None) -> Graph:
     if not graph_def.node:
         raise NotAPolicyError("the graph has no nodes", fix="give the frozen graph that training wrote")
     schema.check_nodes(len(graph_def.node))
+    calls = {f.signature.name for f in graph_def.library.function}
+    allowance = Allowance()
+    nodes = [_node(n, graph_def.versions.producer, allowance, detached) for n in graph_def.node]
     if lacks_values(graph_def):
         raise DamagedFileError(
             "the graph's constants hold no values",
@@ -47,9 +50,6 @@ def from_graph_def(graph_def: Any, detached: Detached | None = None) -> Graph:
             "beside it, and weights_manifest.json says where",
             fix="give the folder with all of them, or freeze the graph again",
         )
-    calls = {f.signature.name for f in graph_def.library.function}
-    allowance = Allowance()
-    nodes = [_node(n, graph_def.versions.producer, allowance, detached) for n in graph_def.node]
     for node in nodes:
         if node.op in calls or node.op in CALLS:
             raise NotAPolicyError(
