@@ -107,7 +107,8 @@ def statistics_of(policy: Policy, vector: TensorSpec) -> tuple[np.ndarray | None
         mean, std = (np.broadcast_to(np.asarray(said[k], float), vector.shape[-1] or 1) for k in ("mean", "std"))
         return mean, std
     graph, name = policy.graph, policy.feeds[vector.name]
-    mean = spread = None
+    centre: np.ndarray | None = None
+    spread: np.ndarray | None = None
     readers = graph.consumers()
     while len(readers[name]) == 1:
         node = readers[name][0]
@@ -117,7 +118,7 @@ def statistics_of(policy: Policy, vector: TensorSpec) -> tuple[np.ndarray | None
                 break
             value = value.reshape(-1).astype(float)
             if node.op == "Sub":
-                mean = value
+                centre = value
             elif node.op == "RealDiv":
                 spread = value
             elif node.op == "Mul":
@@ -125,7 +126,7 @@ def statistics_of(policy: Policy, vector: TensorSpec) -> tuple[np.ndarray | None
             else:
                 break
         name = node.name
-    return (mean, spread) if mean is not None and spread is not None else (None, None)
+    return (centre, spread) if centre is not None and spread is not None else (None, None)
 
 
 def _other(graph: Graph, inputs: Sequence[str], name: str) -> np.ndarray | None:
