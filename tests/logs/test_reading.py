@@ -160,7 +160,7 @@ def test_verify_explains_a_log(tmp_path: Path) -> None:
         ("--require", "onnx"),
         ("--samples", "9"),
         ("--golden", wrong),
-        ("--junit", "a.xml"),
+        ("--junit", str(tmp_path / "a.xml")),
         ("--seed", "3"),
         ("--verify", "none"),
         ("--allow-unverified",),
