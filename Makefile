@@ -18,7 +18,7 @@ help:
 	@echo "make test      lint, types and all tests (installs Chromium, gcc and Mono where apt-get can)"
 	@echo "make docs      the documentation as a site in build/docs"
 	@echo "make gallery   five trained policies that act in a browser, as a static folder in build/gallery"
-	@echo "make figures   docs/figures.md anew, from ../shared (minutes), docs/consumers.md and operators.md"
+	@echo "make figures   docs/figures.md anew, from ../shared (minutes), docs/support-tables.md"
 	@echo "make pictures  the pictures of the page and of a report in docs/pictures, anew, from Chromium (minutes)"
 	@echo "make sizes     code lines of each room beside what it may have, and what was added since REV=…"
 	@echo "make bench     speed, memory and size beside what a user would run instead"

@@ -1,45 +1,42 @@
-"""``python -m tests.consumers``: docs/consumers.md, the tables of ``export-model consumers --json`` as a page."""
+"""``python -m tests.consumers``: the tables of ``export-model consumers --json`` in docs/support-tables.md."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from export_model.converters.consumers.published import consumer_tables
-from tests.commands import ROOT
+from tests.support_tables import table, write
 
-PAGE = ROOT / "docs" / "consumers.md"
-HEAD = """\
-# What Unity's importers misread
+TITLE = "Unity's importers"
+HEAD = f"""\
+## {TITLE}
 
-Barracuda, Sentis and the Inference Engine do not read every ONNX as the operators are defined. Here is what is known,
-by importer and construct: 352 small models, one construct each, run in each importer outside the Editor, and 87 more
-in the players of ML-Agents ([what they do](tasks/unity-checker.md)). What an importer is not named for it reads
-rightly, if the construct was among these. The
-program has more of it: for each importer what it throws, how to fix it, and the small model that shows it.
+Barracuda, Sentis and the Inference Engine do not read every ONNX as the operators are defined. 352 small models, one
+construct each, were run in each importer outside the Editor, and 87 more in the players of ML-Agents
+([what they do](tasks/unity-checker.md)). What is not listed is read rightly, if it was among these. The exceptions,
+fixes and models of evidence are in the program:
 
 ```sh
-export-model consumers                          # the importers
-export-model consumers "Barracuda 2.0.0"        # what one of them misreads
+export-model consumers "Barracuda 2.0.0"        # what one importer misreads
 export-model consumers --json > consumers.json  # everything, with exceptions, fixes and evidence
 ```
 
-`--for` writes a policy without any of it; [`inspect --unity`](tasks/unity-checker.md) finds them in a file. *wrong*:
-it imports and runs, and gives other numbers or another shape, without an error. *refused*: the import throws.
-*fails*: the run throws. *lost*: an output cannot be fetched.
+`--for` writes a policy without any of it; [`inspect --unity`](tasks/unity-checker.md) finds it in a file. *wrong*:
+other numbers or another shape, without an error. *refused*: the import throws. *fails*: the run throws. *lost*: an
+output cannot be fetched.
 """
 
 
 def page() -> str:
-    """Return the page in Markdown."""
+    """Return the part of the page in Markdown."""
     tables = consumer_tables()
-    return "\n".join((HEAD, *_importers(tables), *_readings(tables["readings"]))) + "\n"
+    return "\n".join((HEAD, *_importers(tables), *_readings(tables))) + "\n"
 
 
 def _importers(tables: Mapping[str, Any]) -> Iterator[str]:
-    yield "## Importers\n"
     profiles = tables["profiles"]
-    yield from _table(
+    yield from table(
         ("importer", "of", "`--for`"),
         (
             (i["name"], i["release"], ", ".join(f"`{p['name']}`" for p in profiles if i["name"] in p["importers"]))
@@ -48,28 +45,30 @@ def _importers(tables: Mapping[str, Any]) -> Iterator[str]:
     )
 
 
-def _readings(readings: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """Yield a line for each construct and reading."""
-    yield "## Constructs\n"
-    rules: dict[tuple[str, str, str], list[Mapping[str, Any]]] = {}
-    for r in readings:
-        rules.setdefault((", ".join(r["ops"]), r["construct"], r["reading"]), []).append(r)
-    yield from _table(
-        ("operators", "construct", "reading", "since", "until"),
+def _readings(tables: Mapping[str, Any]) -> Iterator[str]:
+    """Yield a line for each group of operators: each construct, what becomes of it, and in which versions."""
+    yield "### Constructs\n"
+    versions = [i["name"].split()[-1] for i in tables["importers"]]
+    rules: dict[str, dict[tuple[str, str], list[Mapping[str, Any]]]] = {}
+    for r in tables["readings"]:
+        rules.setdefault(", ".join(r["ops"]), {}).setdefault((r["construct"], r["reading"]), []).append(r)
+    yield from table(
+        ("operators", "what is misread, how, and in which versions"),
         (
-            (*key, of[0]["since"], of[-1]["until"] or "")
-            for key, of in sorted(rules.items(), key=lambda item: item[0][0])
+            (ops, "; ".join(f"{what}, *{how}* {_span(rows, versions)}" for (what, how), rows in of.items()))
+            for ops, of in sorted(rules.items())
         ),
     )
 
 
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:
-    yield f"| {' | '.join(head)} |"
-    yield f"|{'---|' * len(head)}"
-    for row in rows:
-        yield f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in row)} |"
-    yield ""
+def _span(readings: Sequence[Mapping[str, Any]], versions: Sequence[str]) -> str:
+    """The first and the last of an importer's versions (each importer has numbers of its own)."""
+    first = min(versions.index(r["since"].split()[-1]) for r in readings)
+    if any(not r["until"] for r in readings):
+        return f"from {versions[first]}"
+    last = max(versions.index(r["until"].split()[-1]) for r in readings)
+    return versions[first] if first == last else f"{versions[first]}–{versions[last]}"
 
 
 if __name__ == "__main__":
-    PAGE.write_text(page(), encoding="utf-8")
+    write(TITLE, page())

@@ -1,4 +1,4 @@
-"""``python -m tests.operators``: docs/operators.md, what each op of the table becomes in each target.
+"""``python -m tests.operators``: what each op of the table becomes in each target, in docs/support-tables.md.
 
 No entry's lowering is read: the samples of an op (tests/graph/samples) are compiled and written, each for each target.
 What stands in the file for it is counted, or the refusal is taken, which names the op.
@@ -38,15 +38,15 @@ from export_model.converters.policy.policy import Policy
 from export_model.signatures.code import CodeOptions
 from export_model.signatures.errors import UnsupportedOpError
 from tests.barracuda.nn_running import action_model, as_policy
-from tests.commands import ROOT
 from tests.graph.harness import policy_of, program_of
 from tests.graph.samples import SAMPLES, Sample
+from tests.support_tables import table, write
 
-PAGE = ROOT / "docs" / "operators.md"
+TITLE = "Operations and targets"
 ONE, SEVERAL, REFUSED = "●", "◐", "○"
 #: Beside the symbol: some samples take several ops where others take one; some are refused.
 SOME_SEVERAL, SOME_REFUSED = "+", "−"
-_PRECISIONS = {"exact": "=", "rounded": "∘", "summed": "∑", "approximate": "≈"}
+_PRECISIONS = {"rounded": "∘", "summed": "∑", "approximate": "≈"}
 _OPTIONS = WriteOptions('{"tool": {"version": "test"}}')
 
 #: Moves and casts, which stand around an operator where axes lie otherwise or a number is narrower: not counted where
@@ -253,22 +253,19 @@ OPS = [op for found in FAMILIES.values() for op in found]
 OLDER = [name for name, entry in TABLE.items() if entry.infer is written_as_older]
 
 HEAD = f"""\
-# Operations and targets
+## {TITLE}
 
-What each operation becomes, found by writing its samples, which the tests compare in all runtimes.
-
-{ONE} one operator of the target, or none (a constant, another view); casts and moved axes do not count. \
-{SEVERAL} several.
-{REFUSED} refused, by name. `{SOME_SEVERAL}`: some forms take several. `{SOME_REFUSED}`: some are refused.
+What each operation becomes, found by writing its samples, which the tests compare in all runtimes. One operator of the
+target, or none (a constant, another view; casts and moved axes do not count), unless its row says: {SEVERAL} several,
+`{SOME_SEVERAL}` some forms take several, `{SOME_REFUSED}` some are refused, {REFUSED} refused by name.
 
 *TensorFlow*: `.bytes`; the SavedModel differs in forms of {", ".join(f"`{op}`" for op in IN_SAVED_MODEL)}, \
-for `tensorflowjs_converter`. *Code*: C, C# and JavaScript, in nests of loops. \
-*Rounds*: {_PRECISIONS["exact"]} never, {_PRECISIONS["rounded"]} once, \
-{_PRECISIONS["summed"]} sums in any order, {_PRECISIONS["approximate"]} approximated (below).
-`_Fused…` are made of layers, for targets that have them.
+for `tensorflowjs_converter`. *Code*: C, C# and JavaScript, in nests of loops. Behind a name: \
+{_PRECISIONS["rounded"]} rounds once, {_PRECISIONS["summed"]} sums in any order, {_PRECISIONS["approximate"]} is \
+approximated (below); the others never round. `_Fused…` are made of layers, for targets that have them.
 """
 BOUNDS = """\
-## Approximated functions
+### Approximated functions
 
 How far results are off at most: units in the last place/absolute, whichever is more. Empty: as *processor*. Measured by
 `tests/runtimes/test_approximations.py` in TensorFlow (1.4 too), onnxruntime, TensorFlow.js; *graphics*: WebGL;
@@ -281,41 +278,43 @@ def writer_cells(op: str) -> list[str]:
     return [cell(outcomes(op, title)) for title in WRITERS]
 
 
-def line(cells: Iterable[str]) -> str:
-    """A line of a table."""
-    return f"| {' | '.join(cells)} |"
+def differences(op: str) -> str:
+    """The targets that have more or less than one operator for an op."""
+    cells = zip(WRITERS, writer_cells(op), strict=True)
+    return ", ".join(f"{title} {found.removeprefix(ONE)}" for title, found in cells if found != ONE)
 
 
-def row(op: str) -> str:
-    """An op's line."""
+def named(op: str) -> str:
+    """An op's name, with a mark where it rounds."""
     entry = TABLE[op]
-    return line([f"`{op}`", _PRECISIONS["exact" if entry.exact else entry.precision], *writer_cells(op)])
+    return f"`{op}`" + ("" if entry.exact or entry.precision == "exact" else _PRECISIONS[entry.precision])
 
 
 def page() -> str:
-    """Return the page in Markdown."""
-    return "\n".join((HEAD, *_matrix(), "", BOUNDS, *_bounds())) + "\n"
+    """Return the part of the page in Markdown."""
+    return "\n".join((HEAD, *_matrix(), "", BOUNDS, *_bounds())) + "\n\n"
 
 
 def _matrix() -> Iterator[str]:
-    titles = ["op", "rounds", *WRITERS]
-    yield line(titles)
-    yield f"|{'---|' * len(titles)}"
-    for family, found in FAMILIES.items():
-        yield line([f"**{family}**", *[""] * (len(titles) - 1)])
-        yield from map(row, found)
-    yield ""
+    """Yield a line for all ops that the targets treat alike, in the order of the first."""
+    alike: dict[str, list[str]] = {}
+    for op in OPS:
+        alike.setdefault(differences(op), []).append(named(op))
+    rows = ((", ".join(ops), where or "one operator everywhere") for where, ops in alike.items())
+    yield from table(("operations", "where not one operator"), rows)
     yield f"Written as these first: {', '.join(f'`{op}`' for op in OLDER)}."
 
 
 def _bounds() -> Iterator[str]:
-    yield line(["op", *APPROXIMATIONS])
-    yield f"|{'---|' * (1 + len(APPROXIMATIONS))}"
     usual, *others = APPROXIMATIONS.values()
-    for op, bound in usual.items():
-        yield line([f"`{op}`", _bound(bound), *("" if o[op] == bound else _bound(o[op]) for o in others)])
+    yield from table(
+        ("op", *APPROXIMATIONS),
+        (
+            [f"`{op}`", _bound(bound), *("" if o[op] == bound else _bound(o[op]) for o in others)]
+            for op, bound in usual.items()
+        ),
+    )
     unmeasured = [o for o in OPS if TABLE[o].precision == "approximate" and o not in usual]
-    yield ""
     yield f"Not measured: {', '.join(f'`{op}`' for op in unmeasured)}."
 
 
@@ -324,4 +323,4 @@ def _bound(bound: tuple[float, float]) -> str:
 
 
 if __name__ == "__main__":
-    PAGE.write_text(page(), encoding="utf-8")
+    write(TITLE, page())

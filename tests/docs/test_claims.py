@@ -26,6 +26,7 @@ from export_model.signatures.errors import ParityError, RuntimeUnavailableError,
 from export_model.signatures.sampling import HUGE_BATCH, LARGE_BATCH, MOST_IDS
 from tests.commands import ROOT, export_model
 from tests.docs.blocks import name_of, pages
+from tests.support_tables import section
 
 #: Options of other programs that the pages show.
 FOREIGN = {
@@ -151,7 +152,7 @@ def test_the_words_of_readme_are_those_of_the_project() -> None:
     tested = json.loads(re.findall(r"matrix: \{ python: (\[.*?\])", workflow)[0])
     assert f"Python {tested[0]} to {tested[-1]} with" in readme and project["requires-python"] == ">=3.11,<3.15"
     assert f"{project['license']}. Tested on Linux" in readme
-    table = (ROOT / "docs/generations.md").read_text(encoding="utf-8").partition("## What")[0]
+    table = section("Generations of ML-Agents").partition("### What")[0]
     rows = re.findall(r"^\| (\d[^|]*) \|", table, re.M)
     oldest, newest = re.findall(r"[\d.]*\d", rows[0])[0], re.findall(r"[\d.]*\d", rows[-1])[-1]
     assert f"ML-Agents {oldest} to {newest}," in readme

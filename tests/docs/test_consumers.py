@@ -1,4 +1,4 @@
-"""docs/consumers.md is what ``python -m tests.consumers`` writes, and the program prints the same tables."""
+"""docs/support-tables.md has what ``python -m tests.consumers`` writes, and the program prints the same tables."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from export_model.converters.consumers.published import consumer_tables
 from export_model.converters.consumers.unity.importers import IMPORTERS
 from tests import consumers
 from tests.commands import export_model, is_refused
+from tests.support_tables import section
 
 
 def test_the_page_is_that_of_the_tables() -> None:
-    assert consumers.PAGE.read_text(encoding="utf-8") == consumers.page()
+    assert section(consumers.TITLE) == consumers.page()
 
 
 def test_the_program_prints_the_tables() -> None:

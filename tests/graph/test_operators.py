@@ -1,4 +1,4 @@
-"""docs/operators.md: each op × target is written as one, as several or refused by its name, and the page says which."""
+"""docs/support-tables.md: each op × target is written as one, as several or refused by its name, and it says which."""
 
 from __future__ import annotations
 
@@ -9,19 +9,26 @@ from export_model.converters.graph.ops.table import SPELLINGS, TABLE
 from tests import operators
 from tests.graph.samples import SAMPLES
 from tests.operators import ONE, OPS, REFUSED, SEVERAL, WRITERS, Outcome, cell, outcomes
+from tests.support_tables import section
 
 each_op = pytest.mark.parametrize("op", OPS)
-LINES = operators.PAGE.read_text(encoding="utf-8").splitlines()
+LINES = section(operators.TITLE).splitlines()
 
 
 def titled(op: str) -> list[str]:
-    return [line for line in LINES if line.startswith(f"| `{op}` |")]
+    """The rows of the first table in which an op is named."""
+    rows = [line for line in LINES[: LINES.index("### Approximated functions")] if line.startswith("| `")]
+    return [row for row in rows if f"`{op}`" in row.split(" | ")[0]]
 
 
 def cells_of(op: str) -> dict[str, str]:
-    """An op's cells in the committed page, by the titles of the columns."""
-    (titles,) = (line for line in LINES if line.startswith("| op | rounds |"))
-    return dict(zip(titles.strip("| ").split(" | "), titled(op)[0].strip("| ").split(" | "), strict=True))
+    """An op's cells in the committed page, by the titles of the targets."""
+    (row,) = titled(op)
+    where = row.strip("| ").split(" | ")[1]
+    said = dict(part.rsplit(" ", 1) for part in where.split(", ") if where != "one operator everywhere")
+    cells = {title: said.pop(title, ONE) for title in WRITERS}
+    assert not said
+    return {title: cell if cell[0] in (ONE, SEVERAL, REFUSED) else ONE + cell for title, cell in cells.items()}
 
 
 def test_every_op_has_a_row_or_is_written_as_those_that_have() -> None:
@@ -30,6 +37,7 @@ def test_every_op_has_a_row_or_is_written_as_those_that_have() -> None:
     assert {*OPS, *operators.OLDER} == set(TABLE)
     (older,) = (line for line in LINES if line.startswith("Written as these first"))
     assert all((f"`{op}`" in older) == (TABLE[op].infer is written_as_older) for op in TABLE)
+    assert all(len(titled(op)) == 1 for op in OPS)
     assert not any(titled(op) for op in SPELLINGS)
 
 
@@ -46,7 +54,7 @@ def test_each_target_writes_an_op_or_refuses_it_by_its_name(op: str) -> None:
 
 
 def test_the_page_is_that_of_the_samples() -> None:
-    assert operators.PAGE.read_text(encoding="utf-8") == operators.page()
+    assert section(operators.TITLE) == operators.page()
 
 
 def test_each_row_of_the_saved_model_is_needed() -> None:

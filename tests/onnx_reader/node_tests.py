@@ -5,7 +5,8 @@ inputs and expected outputs, of fixed shapes. Here one observation, without a ba
 the compiler takes as computed ones, the others are constants, and all outputs are one action. So every export is of a
 model for one agent, and is run with several.
 
-``python -m tests.onnx_reader.node_tests`` runs all of them, numpy and onnxruntime, and writes docs/onnx-operators.md.
+``python -m tests.onnx_reader.node_tests`` runs all of them, numpy and onnxruntime, and writes its part of
+docs/support-tables.md.
 """
 
 from __future__ import annotations
@@ -33,9 +34,9 @@ from export_model.converters.runtimes.pool import RuntimePool
 from export_model.exporter.export.sources import read_source
 from export_model.signatures.errors import ExportModelError
 from export_model.signatures.roles import Role
-from tests.commands import ROOT
+from tests.support_tables import table, write
 
-PAGE = ROOT / "docs/onnx-operators.md"
+TITLE = "Operators of ONNX"
 ROWS = 3
 #: dtype kinds that a policy computes in
 _NUMBERS = "fiub"
@@ -226,7 +227,7 @@ def _short(error: ExportModelError) -> str:
 
 
 def page(outcomes: Sequence[tuple[NodeTest, Outcome]]) -> str:
-    """docs/onnx-operators.md: counts, and what is refused, with the reason. Expansions of an operator count with it."""
+    """The part of the page: counts, and what is refused, with the reason. Expansions of an operator count with it."""
     states = Counter(o.state for _, o in outcomes)
     refused: dict[str, dict[str, int]] = {}
     right = {t.subject.partition(",")[0] for t, o in outcomes if o.state == "right"}
@@ -235,7 +236,7 @@ def page(outcomes: Sequence[tuple[NodeTest, Outcome]]) -> str:
             reasons = refused.setdefault(test.subject.partition(",")[0], {})
             reasons[found.reason] = reasons.get(found.reason, 0) + 1
     lines = [
-        "# Operators of ONNX",
+        f"## {TITLE}",
         "",
         f"ONNX's own tests of its operators (onnx {onnx.__version__}, {len(outcomes)} tests), each made into a policy:",
         "one observation without a batch axis is cut into the test's inputs, its outputs are the action. The export is",
@@ -245,18 +246,19 @@ def page(outcomes: Sequence[tuple[NodeTest, Outcome]]) -> str:
         "",
         f"Converted in at least one form: {', '.join(sorted(right))}.",
         "",
-        "What is refused, by reason, with the number of tests:",
+        "What is refused, with the number of tests:",
         "",
-        "| reason | operators |",
-        "|---|---|",
     ]
     by_reason: dict[str, Counter[str]] = {}
     for kind, reasons in refused.items():
         for reason, count in reasons.items():
             by_reason.setdefault(reason, Counter())[kind] += count
-    for reason, kinds in sorted(by_reason.items(), key=lambda item: (-item[1].total(), item[0])):
-        lines.append(f"| {reason} | {', '.join(f'{kind} {count}' for kind, count in sorted(kinds.items()))} |")
-    return "\n".join([*lines, ""])
+    rows = sorted(by_reason.items(), key=lambda item: (-item[1].total(), item[0]))
+    lines += table(
+        ("reason", "operators"),
+        ((f"{reason}: {kinds.total()}", ", ".join(sorted(kinds))) for reason, kinds in rows),
+    )
+    return "\n".join(lines)
 
 
 def main() -> None:
@@ -267,7 +269,7 @@ def main() -> None:
             found.append((test, outcome(test, Path(folder), pool)))
             if found[-1][1].state == "wrong":
                 print(test.name, found[-1][1].reason, flush=True)
-    PAGE.write_text(page(found), encoding="utf-8")
+    write(TITLE, page(found))
     print(Counter(o.state for _, o in found))
 
 
