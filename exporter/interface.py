@@ -16,6 +16,7 @@ from export_model.exporter.export.options import ExportOptions, storage
 from export_model.exporter.export.pipeline import ExportResult
 from export_model.exporter.export.pipeline import export as run_export
 from export_model.exporter.export.sources import Source, live_source
+from export_model.exporter.fleet.sources import in_folder
 from export_model.exporter.inspect.inspection import Inspection, inspect_source
 from export_model.exporter.options import ReadOptions, WriteOptions, compile_options
 from export_model.exporter.play.options import PlayOptions
@@ -88,7 +89,7 @@ def export(
         bake=write.bake,
     )
     live = {"session": session, "tf_function": tf_function, "keras_model": keras_model}
-    with _sources(source, live, read.step) as sources:
+    with _sources(source, live, options) as sources:
         results = []
         for result in run_export(sources, options, _LOG.info):
             results.append(result)
@@ -111,9 +112,9 @@ def _judged_by(verify: str | Sequence[str] | VerifyOptions) -> VerifyOptions:
 
 @contextmanager
 def _sources(
-    source: Path | str | Sequence[Path | str] | None, objects: Mapping[str, Any], step: int | None
+    source: Path | str | Sequence[Path | str] | None, objects: Mapping[str, Any], options: ExportOptions
 ) -> Iterator[Sequence[Path | str | Source]]:
-    """Yield what the pipeline takes. Raises UsageError unless there is exactly one source."""
+    """Yield what the pipeline takes, of a folder what it stands for. Raises UsageError unless there is one source."""
     live = {key: value for key, value in objects.items() if value is not None}
     names = [*(["source"] if source is not None else []), *live]
     if len(names) != 1:
@@ -122,9 +123,10 @@ def _sources(
             fix=f"give one of: source, {', '.join(objects)}",
         )
     if source is not None:
-        yield [source] if isinstance(source, str | Path) else list(source)
+        given = [source] if isinstance(source, str | Path) else source
+        yield [one for path in given for one in in_folder(Path(path), options.out, options.read)]
         return
-    if step is not None:
+    if (step := options.read.step) is not None:
         raise UsageError(f"step={step} goes with a folder", fix=f"leave it out: {names[0]} has the values of now")
     with live_source(names[0], live[names[0]]) as opened:
         yield [opened]

@@ -132,9 +132,11 @@ def export_command(
         code=code,
         bake=bake,
     )
-    many = again or fail_fast or jobs is not None or cluster is not None or _are_many(sources, out)
+    many = again or fail_fast or cluster is not None or _are_many(sources, job)
+    if jobs is not None:  # of one source they say nothing, but what is wrong with them is said
+        many = many or jobs < 1 or len(sources) != 1
     if env is not None:
-        _check_playable(env, 2 if many else len(sources), runtimes, profile, bake)
+        _check_playable(env, 2 if many or jobs is not None else len(sources), runtimes, profile, bake)
     if many:
         from export_model.exporter.cli.fleet import run_fleet
 
@@ -143,12 +145,12 @@ def export_command(
         _export_few(sources, job, env, console)
 
 
-def _are_many(sources: Sequence[Path], out: Path) -> bool:
+def _are_many(sources: Sequence[Path], job: ExportOptions) -> bool:
     """Whether a fleet exports them: folders, globs and lists, or bundles that are sent to an address."""
     from export_model.converters.files.fetch import address_of
     from export_model.exporter.fleet.sources import is_many
 
-    return is_many(sources) or address_of(out) is not None
+    return is_many(sources, job.read) or address_of(job.out) is not None
 
 
 def _export_few(sources: Sequence[Path], job: ExportOptions, env: str | None, console: Console) -> None:

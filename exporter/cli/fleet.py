@@ -15,7 +15,7 @@ from export_model.exporter.cli.console import Console
 from export_model.exporter.cli.options import RULES, as_given
 from export_model.exporter.cli.terminal import say_lines
 from export_model.exporter.fleet.fleet import export_fleet
-from export_model.exporter.fleet.sources import paths_text, sources_in
+from export_model.exporter.fleet.sources import PassedOver, paths_text, sources_in
 from export_model.exporter.fleet.worker import Outcome, Wanted
 from export_model.exporter.tables import count_text
 from export_model.signatures.errors import ExportModelError, UsageError
@@ -43,11 +43,14 @@ def run_fleet(
     """
     if cluster is not None and jobs is not None:
         raise UsageError("--jobs and --cluster contradict each other", fix="a cluster's workers are as many as it has")
-    passed_over: list[Path] = []
-    paths = sources_in(given, options.out, passed_over)
-    if passed_over and not console.quiet:
-        many = f"{len(passed_over)} files that are not models" if len(passed_over) > 1 else "a file that is not a model"
-        say_lines(f"note: the pattern also matches {many}: {paths_text(passed_over)}", err=True)
+    passed_over = PassedOver()
+    paths = sources_in(given, options.out, passed_over, options.read)
+    if passed_over.others and not console.quiet:
+        count = len(passed_over.others)
+        many = f"{count} files that are not models" if count > 1 else "a file that is not a model"
+        say_lines(f"note: the pattern also matches {many}: {paths_text(passed_over.others)}", err=True)
+    if passed_over.forms and not console.quiet:
+        say_lines(f"note: also here, not used: {paths_text(passed_over.forms)} (give them by their paths)", err=True)
     wanted = Wanted(console.as_json, console.wants_reports)
     tally = _Tally(len(paths))
     entries: list[Entry] = []

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from export_model import export
 from export_model.exporter.cli.fleet import _Tally
 from export_model.exporter.export.pipeline import Exporter, ExportOptions
 from export_model.exporter.fleet.fleet import export_fleet
@@ -60,6 +61,36 @@ def test_what_is_written_does_not_depend_on_the_number_of_processes(sources: lis
     assert len(names) == len(set(names)) == 10
     assert "a-continuous" not in names  # the first in order has the plain name, whoever is quicker
     assert {"continuous", "b-continuous"} < set(names)
+
+
+@pytest.mark.parametrize("kind", ["files", "folders", "run"])
+def test_a_folder_is_exported_the_same_way_whatever_jobs_say(kind: str, sources: list[Path], tmp_path: Path) -> None:
+    """The bytes, what is recorded, and by Python, too; another file in the folder changes nothing for the others."""
+    folder = {"files": tmp_path / "a", "folders": tmp_path / "made", "run": run_folder("3DBall")}[kind]
+    sources[2].unlink()  # the broken one
+    for place in ("one", "two/three"):
+        shutil.copytree(tmp_path / "b", tmp_path / "made" / place)
+    found = {}
+    for jobs in ([], ["--jobs", "1"], ["--jobs", "2"]):
+        out = tmp_path / f"out{len(found)}"
+        assert export_model(folder, "-o", out, "--verify", "none", *jobs).status == 0
+        ledger = out / ".exported.jsonl"
+        found[" ".join(jobs)] = contents(out), sorted(lines_of(ledger))
+    assert found[""] == found["--jobs 1"] == found["--jobs 2"]
+    bundles, recorded = found[""]
+    assert len(recorded) == {"files": 4, "folders": 8, "run": 0}[kind]  # a run is one source, as a file is
+    export(folder, tmp_path / "python", verify="none")
+    assert contents(tmp_path / "python") == bundles
+    if kind != "run":
+        shutil.copy(fixture("recurrent"), folder / "recurrent.bytes")
+        assert export_model(folder, "-o", tmp_path / "more", "--verify", "none").status == 0
+        more = contents(tmp_path / "more")
+        assert {name: more[name] for name in bundles} == bundles
+        assert "recurrent/recurrent.bytes" in more
+
+
+def lines_of(path: Path) -> list[str]:
+    return path.read_text().splitlines() if path.exists() else []
 
 
 def test_what_is_unchanged_is_left_out(sources: list[Path], tmp_path: Path) -> None:

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from export_model.exporter.fleet.sources import is_many, sources_in
+from export_model.converters.formats.source import ReadOptions
+from export_model.exporter.fleet.sources import PassedOver, is_many, sources_in
 from export_model.signatures.errors import ExportModelError
 from fixtures import path as fixture
 from tests.commands import ROOT
@@ -62,9 +63,26 @@ def test_a_file_and_a_run_are_one_source(place: Path) -> None:
 
 
 def test_files_in_a_folder_are_one_source_each(place: Path) -> None:
-    """Such a folder is read as a run's, all at once, where it is given alone."""
+    """And so are those in its folders; a second form of one is named, not exported."""
+    shutil.copytree(place / "runs/b", place / "runs/a/deeper")
+    shutil.copy(fixture("continuous"), place / "runs/a/two.pb")
+    assert is_many([Path("runs/a")])
+    passed_over = PassedOver()
+    found = sources_in([Path("runs/a")], Path("out"), passed_over)
+    assert found == [Path("runs/a/one.bytes"), Path("runs/a/two.bytes"), Path("runs/a/deeper/model.weights")]
+    assert passed_over == PassedOver([], [Path("runs/a/two.pb")])
+
+
+def test_a_run_with_a_folder_for_each_behavior_is_one_source(place: Path) -> None:
+    """Its final exports lie beside the folders (ML-Agents 0.6 and later)."""
+    shutil.copytree(place / "runs/ball/3DBall", place / "runs/a/one")
     assert not is_many([Path("runs/a")])
-    assert sources_in([Path("runs/a")], Path("out")) == [Path("runs/a/one.bytes"), Path("runs/a/two.bytes")]
+    assert sources_in([Path("runs/a")], Path("out")) == [Path("runs/a")]
+
+
+def test_a_folder_of_which_a_step_is_asked_is_one_source(place: Path) -> None:
+    assert not is_many([Path("runs/a")], ReadOptions(step=5))
+    assert sources_in([Path("runs/a")], Path("out"), read=ReadOptions(step=5)) == [Path("runs/a")]
 
 
 @pytest.mark.parametrize(("given", "words"), [("*.onnx", "matches no model"), ("empty", "no model found in")])
