@@ -145,7 +145,11 @@ class Member(Struct, frozen=True):
 
 
 class Code(Struct, frozen=True):
-    """A snippet: how to call an artefact of a format. ``text`` has ``$path`` for what a loader is given, in quotes."""
+    """A snippet: how to call an artefact of a format.
+
+    ``text`` has ``$path`` for what a loader is given, in quotes, and ``$play`` for Python that calls a function
+    ``policy`` with the inputs by name, and prints the action.
+    """
 
     name: str
     title: str

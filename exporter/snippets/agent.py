@@ -19,6 +19,7 @@ from export_model.exporter.snippets.contract import (
     number_names,
     wrap_items,
 )
+from export_model.exporter.tables import count_text
 from export_model.signatures.roles import SENSOR_ORDER, Role
 from export_model.signatures.spec import TensorSpec
 
@@ -130,7 +131,7 @@ def _actions(bundle: SnippetBundle) -> tuple[list[str], list[str]]:
     received, own = [], []
     if count:
         labels = bundle.signature.labels.get("actions", [])
-        received += [f"// {line}" for line in wrap_items(f"{count} continuous actions", number_names(labels))]
+        received += [f"// {line}" for line in wrap_items(count_text(count, "continuous action"), number_names(labels))]
         received.append("var continuous = actions.ContinuousActions;")
         own.append("var continuous = actionsOut.ContinuousActions;")
         own += [f"continuous[{i}] = 0f;" for i in range(min(count, 8))]

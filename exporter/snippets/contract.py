@@ -19,6 +19,7 @@ from export_model.converters.formats.frozen_graph.reader import read_graph
 from export_model.converters.formats.registry import FROZEN_GRAPH
 from export_model.converters.interfaces.text import ALL, loop_lines, term_lines
 from export_model.exporter.meanings import feed_text
+from export_model.exporter.tables import count_text
 from export_model.signatures.contract import Contract
 from export_model.signatures.errors import naming
 from export_model.signatures.roles import Role
@@ -45,6 +46,8 @@ class SnippetBundle(Struct, frozen=True):
     nodes: frozenset[str] = frozenset()
     #: the consumer that it was made for (``--for``)
     made_for: str | None = None
+    #: whether noise is drawn inside its files (``--noise keep``, ``--for``)
+    draws_itself: bool = False
 
     def path(self, relative: str) -> str:
         """A file of the bundle, with slashes."""
@@ -115,12 +118,6 @@ class SnippetBundle(Struct, frozen=True):
         return {name: self.plain(head) for name, head in zip(self.variables, self.heads, strict=True)}
 
     @property
-    def played_outputs(self) -> dict[str, TensorSpec]:
-        """Variable → the output that a snippet makes its action of: odds where there are some, of which it draws."""
-        pairs = zip(self.variables, self.heads, strict=True)
-        return {name: head if head.role in ODDS else self.plain(head) for name, head in pairs}
-
-    @property
     def discrete_variable(self) -> str:
         """The variable with the discrete actions, which the next step may be fed."""
         return "action" if len(self.heads) == 1 else "discrete"
@@ -138,8 +135,9 @@ def read_bundle(folder: Path) -> SnippetBundle:
         found.verify_hashes(frozen)
         with naming(found.path(frozen)):
             nodes = frozenset(node.name for node in read_graph(found.path(frozen).read_bytes()).nodes)
-    made_for = found.contract.tool.get("profile")
-    return SnippetBundle(folder, found.name, _as_fed(found.contract), frozenset(found.contract.files), nodes, made_for)
+    made_for, source = found.contract.tool.get("profile"), found.contract.source
+    kept, files = source.noise_kept and bool(source.noise), frozenset(found.contract.files)
+    return SnippetBundle(folder, found.name, _as_fed(found.contract), files, nodes, made_for, draws_itself=kept)
 
 
 def _as_fed(contract: Contract) -> PolicySignature:
@@ -171,16 +169,55 @@ def meaning(bundle: SnippetBundle, spec: TensorSpec) -> list[str]:
     ]
 
 
-def action_meaning(bundle: SnippetBundle, head: TensorSpec) -> list[str]:
-    """Comment lines on an action."""
+def action_meaning(bundle: SnippetBundle, head: TensorSpec, drawing: str = "") -> list[str]:
+    """Comment lines on an action: how many numbers, what they are called, and what would draw it (``drawing``)."""
+    chance = list(filter(None, [chance_text(bundle, head, drawing)]))
     if head.is_continuous:
         names = number_names(bundle.signature.labels.get("actions", []))
         return [
-            *wrap_items(f"{head.shape[-1]} continuous actions", names),
+            *wrap_items(count_text(head.shape[-1] or 0, "continuous action"), names),
+            *chance,
             *_interface_lines(bundle.signature, head.name),
             *(line for text in loop_lines(bundle.signature.interface, ALL) for line in textwrap.wrap(text, WIDTH)),
         ]
-    return branch_lines(bundle)
+    return [*branch_lines(bundle), *chance]
+
+
+def is_drawn_inside(bundle: SnippetBundle, head: TensorSpec) -> bool:
+    """Whether the file draws ``head``'s action, and has none without chance."""
+    drawn = head.role is Role.SAMPLED or (head.role is Role.CONTINUOUS and bundle.draws_itself)
+    return drawn and bundle.plain(head) == head
+
+
+def chance_text(bundle: SnippetBundle, head: TensorSpec, drawing: str = "") -> str:
+    """Say that ``head``'s action is the deterministic one, and what draws it; nothing where there is no chance."""
+    signature = bundle.signature
+    spread = next((s.name for s in signature.outputs if s.role in (Role.STD, Role.LOG_STD)), None)
+    if is_drawn_inside(bundle, head):
+        return "drawn inside the file, which has no deterministic action"
+    if head.role in ODDS:
+        drawn = f"by the {'log-' if head.role is Role.LOG_PROBS else ''}probabilities in {head.name}"
+    elif bundle.plain(head) != head:
+        drawn = head.name
+    elif head.is_continuous and signature.noise:
+        drawn = f"feed N(0, 1) as {', '.join(s.name for s in signature.noise)}"
+    elif head.is_continuous and spread is not None:
+        drawn = f"N({head.name}, {spread})"
+    else:
+        return ""
+    return f"deterministic; drawn: {drawing or drawn}"
+
+
+def agent_text(bundle: SnippetBundle) -> str:
+    """What the policy does and what its agents keep, in words, for the comment above ``policy.agent``."""
+    acts = [
+        count_text(head.shape[-1] or 0, "continuous action")
+        if head.is_continuous
+        else count_text(len(bundle.signature.branches), "discrete action")
+        for head in bundle.heads
+    ]
+    kept = "a memory: agents.reset() where an episode begins" if bundle.remembers else "no memory"
+    return f"{' and '.join(acts)}, {kept}"
 
 
 def _interface_lines(signature: PolicySignature, name: str) -> list[str]:
@@ -195,7 +232,7 @@ def branch_lines(bundle: SnippetBundle) -> list[str]:
     lines: list[str] = []
     for i, size in enumerate(bundle.signature.branches):
         names = number_names(labels[i]) if i < len(labels) else []
-        lines += wrap_items(f"branch {i}: {size} actions", names)
+        lines += wrap_items(f"branch {i}: {count_text(size, 'action')}", names)
     return lines
 
 

@@ -46,19 +46,14 @@ def tensorflowsharp(bundle: SnippetBundle) -> str:
         lines += [f"// {line}" for line in meaning(bundle, spec)]
         value = bundle.kept_variables.get(spec.name) or _array(spec)
         lines.append(f"runner.AddInput(graph[{string_literal(spec.name)}][0], {value});")
-    fetched = bundle.played_outputs
-    before = [*(["var random = new Random();"] if any(s.role in ODDS for s in fetched.values()) else []), *before]
+    fetched = bundle.fetched_outputs
     outputs = [*fetched.values()] if memory is None else [*fetched.values(), bundle.signature.output(memory[1])]
     lines += [f"runner.Fetch(graph[{string_literal(spec.name)}][0]);" for spec in outputs]
     lines.append("TFTensor[] output = runner.Run();")
     for i, (name, spec) in enumerate(fetched.items()):
         lines += [f"// {line}" for line in action_meaning(bundle, bundle.heads[i])]
-        head, value = bundle.heads[i], f"({_kind(spec)})output[{i}].GetValue()"
-        if spec.role in ODDS:
-            lines += _draws(bundle, name, spec, value)
-            continue
-        hint = "" if head == spec else f"  // deterministic; drawn: graph[{string_literal(head.name)}]"
-        lines.append(f"var {name} = {value};{hint}")
+        value = f"({_kind(spec)})output[{i}].GetValue()"
+        lines += _likeliest(bundle, name, value, "1, ", "0, ") if spec.role in ODDS else [f"var {name} = {value};"]
     if memory is not None:
         lines.append(f"memory = ({_kind(bundle.signature.output(memory[1]))})output[{len(fetched)}].GetValue();")
     if previous is not None:
@@ -82,33 +77,15 @@ def tensorflowsharp(bundle: SnippetBundle) -> str:
     )
 
 
-def _draws(bundle: SnippetBundle, name: str, odds: TensorSpec, value: str) -> list[str]:
-    """Lines that draw a class of each branch, of log-probabilities or probabilities."""
-    sizes, score = ", ".join(map(str, bundle.signature.branches)), "odds[agent, start + i]"
-    plain = bundle.plain(odds)
-    hint = "" if plain == odds else f"  // deterministic: graph[{string_literal(plain.name)}]"
+def _likeliest(bundle: SnippetBundle, name: str, value: str, rows: str = "", row: str = "") -> list[str]:
+    """Lines that take the likeliest class of each branch, of odds [1, ΣB] (``rows`` and ``row``) or [ΣB]."""
     return [
-        f"var odds = {value};{hint}",
-        f"int[] sizes = {{ {sizes} }};",
-        f"var {name} = new int[odds.GetLength(0), sizes.Length];",
-        "// a class from each branch: the largest of log-probability + Gumbel noise",
-        f"for (var agent = 0; agent < {name}.GetLength(0); agent++)",
-        "{",
-        "    for (int branch = 0, start = 0; branch < sizes.Length; start += sizes[branch++])",
-        "    {",
-        "        var best = double.NegativeInfinity;",
-        "        for (var i = 0; i < sizes[branch]; i++)",
-        "        {",
-        f"            var p = {score if odds.role is Role.LOG_PROBS else f'Math.Log({score})'};",
-        "            var drawn = p - Math.Log(-Math.Log(random.NextDouble()));",
-        "            if (drawn > best)",
-        "            {",
-        "                best = drawn;",
-        f"                {name}[agent, branch] = i;",
-        "            }",
-        "        }",
-        "    }",
-        "}",
+        f"var odds = {value};",
+        f"int[] sizes = {{ {', '.join(map(str, bundle.signature.branches))} }};",
+        f"var {name} = new int[{rows}sizes.Length];",
+        "for (int branch = 0, start = 0; branch < sizes.Length; start += sizes[branch++])",
+        "    for (var i = 1; i < sizes[branch]; i++)",
+        f"        if (odds[{row}start + i] > odds[{row}start + {name}[{row}branch]]) {name}[{row}branch] = i;",
     ]
 
 
@@ -158,13 +135,14 @@ def inference_engine(bundle: SnippetBundle) -> str:
     for (name, spec), head in zip(fetched.items(), bundle.heads, strict=True):
         body += [f"// {line}" for line in action_meaning(bundle, head)]
         body.append(_read(spec, f"{name}Tensor"))
-        body.append(f"var {name} = {name}Tensor.DownloadToArray();")
+        value = f"{name}Tensor.DownloadToArray()"
+        body += _likeliest(bundle, name, value) if spec.role in ODDS else [f"var {name} = {value};"]
     for _, given, variable in bundle.memories:
         body.append(_read(bundle.signature.output(given), f"{variable}Tensor"))
         body.append(f"{variable} = {variable}Tensor.DownloadToArray();")
     if previous is not None:
         body.append(f"previous = {bundle.discrete_variable};")
-    kinds = [f"{'float' if s.dtype == 'float32' else 'int'}[]" for s in fetched.values()]
+    kinds = ["float[]" if s.is_continuous else "int[]" for s in bundle.heads]
     if len(fetched) == 1:
         result, answer = kinds[0], next(iter(fetched))
     else:
@@ -212,34 +190,27 @@ def source_agent(bundle: SnippetBundle) -> str:
     members = {f.spec.name: f.name for f in header.outputs}
     given = list[str]()
     for head in bundle.heads:
-        name = members[head.name]
-        if head.role is Role.LOG_PROBS:
-            given += ["policy.Choose(classes);", *_discrete("classes")]
-        elif head.is_continuous:
+        name = members[bundle.plain(head).name]
+        given += [f"// {line}" for line in action_meaning(bundle, head)]
+        if head.is_continuous:
             given += [
                 "var continuous = actionsOut.ContinuousActions;",
                 f"for (int i = 0; i < continuous.Length; i++) continuous[i] = policy.{name}[i];",
             ]
         else:
-            given += _discrete(f"policy.{members[bundle.plain(head).name]}")
+            given += [
+                "var discrete = actionsOut.DiscreteActions;",
+                f"for (int i = 0; i < discrete.Length; i++) discrete[i] = (int)policy.{name}[i];",
+            ]
     previous = next((f for f in header.inputs if f.spec.role is Role.PREV_ACTION), None)
     if previous is not None:
         one = f"policy.{previous.name}"
         given.append(f"for (int i = 0; i < {one}.Length; i++) {one}[i] = discrete[i];")
-    classes = len(signature.branches)
     return fill_template(
         "source_agent.cs",
         file=f"{bundle.name}.cs",
         type=f"{header.class_name}Agent",
         policy=header.class_name,
-        classes=f"    readonly int[] classes = new int[{classes}];\n" if "policy.Choose(classes);" in given else "",
         filled="".join(f"        {line}\n" for line in filled),
         given="".join(f"        {line}\n" for line in given),
     )
-
-
-def _discrete(source: str) -> list[str]:
-    return [
-        "var discrete = actionsOut.DiscreteActions;",
-        f"for (int i = 0; i < discrete.Length; i++) discrete[i] = (int){source}[i];",
-    ]

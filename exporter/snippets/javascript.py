@@ -15,9 +15,11 @@ from export_model.exporter.snippets.contract import (
     STEPS,
     SnippetBundle,
     action_meaning,
+    agent_text,
     example_shape,
     example_size,
     fill_template,
+    is_drawn_inside,
     meaning,
     string_literal,
 )
@@ -106,12 +108,11 @@ def _agents(bundle: SnippetBundle) -> str:
         extra += [f"  {line}" for spec in parameters for line in _entry(bundle, spec, _flat(spec))]
         extra.append("  },")
     lines += ["}, {", *extra, "});"] if extra else ["});"]
-    lines += [f"// {_safe(line)}" for head in bundle.heads for line in action_meaning(bundle, head)]
+    for head in bundle.heads:
+        lines += [f"// {_safe(line)}" for line in action_meaning(bundle, head, "policy.agent()")]
     lines.append(f"console.log({', '.join(f'decision.{kind}' for kind in bundle.kinds)});  // a row per agent")
-    start = [
-        "// agents.reset() where an episode begins; policy.agent({ deterministic: true }): no draws",
-        "const agents = policy.agent();",
-    ]
+    how = "" if any(is_drawn_inside(bundle, head) for head in bundle.heads) else "{ deterministic: true }"
+    start = [f"// {agent_text(bundle)}", f"const agents = policy.agent({how});"]
     return "\n".join([*start, *_loop_lines(bundle, lines)])
 
 
@@ -121,11 +122,11 @@ def _plain(bundle: SnippetBundle, value: Callable[[TensorSpec], str], run: str, 
     for spec in bundle.signature.inputs:
         lines += _entry(bundle, spec, bundle.kept_variables.get(spec.name) or value(spec))
     lines += ["};", run]
-    for (name, output), head in zip(bundle.played_outputs.items(), bundle.heads, strict=True):
+    for name, output in bundle.fetched_outputs.items():
         found, tensorflow = read.format(string_literal(output.name)), value is _tf_value
-        drawn = f"({found}).map(draw)" if tensorflow else f"draw({found})"
-        lines.append(f"const {name} = {drawn if output.role in ODDS else found};{_other(bundle, head)}")
-    before = [*_draw(bundle), *bundle.beginnings("let {} = {};  // {}", value)]
+        likeliest = f"({found}).map(likeliest)" if tensorflow else f"likeliest({found})"
+        lines.append(f"const {name} = {likeliest if output.role in ODDS else found};")
+    before = [*_likeliest(bundle), *bundle.beginnings("let {} = {};  // {}", value)]
     previous = bundle.previous
     lines += [f"{variable} = outputs[{string_literal(given)}];" for _, given, variable in bundle.memories]
     if previous is not None:
@@ -135,28 +136,16 @@ def _plain(bundle: SnippetBundle, value: Callable[[TensorSpec], str], run: str, 
     return "\n".join([*before, *_loop_lines(bundle, lines)])
 
 
-def _other(bundle: SnippetBundle, head: TensorSpec) -> str:
-    """The comment that names the action without chance, or with it, that a line does not take."""
-    plain = bundle.plain(head)
-    if plain == head:
-        return ""
-    what, other = ("drawn; deterministic", plain) if head.role in ODDS else ("deterministic; drawn", head)
-    return f"  // {what}: outputs[{string_literal(other.name)}]"
-
-
-def _draw(bundle: SnippetBundle) -> list[str]:
-    """The function that draws a class of each branch, where an action is odds."""
-    roles = [head.role for head in bundle.heads if head.role in ODDS]
-    if not roles:
+def _likeliest(bundle: SnippetBundle) -> list[str]:
+    """The function that takes the likeliest class of each branch, where odds are all that there is."""
+    if not any(output.role in ODDS for output in bundle.fetched_outputs.values()):
         return []
-    score = "p" if roles[0] is Role.LOG_PROBS else "Math.log(p)"
     return [
-        "// a class from each branch: the largest of log-probability + Gumbel noise",
-        "const draw = (row) => {",
+        "const likeliest = (row) => {",
         "  let end = 0;",
         f"  return {list(bundle.signature.branches)}.map((size) => {{",
-        f"    const drawn = row.slice(end, (end += size)).map((p) => {score} - Math.log(-Math.log(Math.random())));",
-        "    return drawn.indexOf(Math.max(...drawn));",
+        "    const branch = row.slice(end, (end += size));",
+        "    return branch.indexOf(Math.max(...branch));",
         "  });",
         "};",
     ]

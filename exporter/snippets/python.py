@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from msgspec.structs import replace
+
 from export_model.converters.formats.registry import ONNX, SAVED_MODEL
 from export_model.exporter.snippets.contract import (
     ODDS,
     STEPS,
     SnippetBundle,
     action_meaning,
+    agent_text,
     example_shape,
     fill_template,
+    is_drawn_inside,
     meaning,
     string_literal,
 )
@@ -42,6 +46,7 @@ def load_policy(bundle: SnippetBundle) -> str:
     """The bundle by this tool's own package."""
     masks = next((s for s in bundle.signature.inputs if s.role is Role.MASKS), None)
     parameters = [s for s in bundle.signature.inputs if s.role is Role.PARAMETER]
+    inside = any(is_drawn_inside(bundle, head) for head in bundle.heads)
     lines = ["decision = agents.decide(", "    {"]
     for spec in bundle.signature.observations:
         lines += [f"    {line}" for line in _entry(bundle, spec, array(spec))]
@@ -56,19 +61,30 @@ def load_policy(bundle: SnippetBundle) -> str:
         lines.append("    },")
     lines.append(")")
     for head in bundle.heads:
-        lines += [f"# {text}" for text in action_meaning(bundle, head)]
+        lines += [f"# {text}" for text in action_meaning(bundle, head, "policy.agent()")]
     lines.append(f"print({', '.join(f'decision.{kind}' for kind in bundle.kinds)})")
-    return fill_template("load_policy.py", path=string_literal(bundle.folder.as_posix()), play=loop_text(bundle, lines))
+    return fill_template(
+        "load_policy.py",
+        path=string_literal(bundle.folder.as_posix()),
+        says=agent_text(bundle),
+        how="" if inside else "deterministic=True",
+        play=loop_text(bundle, lines),
+    )
 
 
-def play(bundle: SnippetBundle, run: list[str]) -> str:
-    """From feeds to actions by ``run``, which makes ``outputs`` (name → array) of ``feeds``."""
-    before = ["rng = np.random.default_rng()"] if _draws(bundle) else []
-    before += bundle.beginnings("{} = {}  # {}", array)
+def play(bundle: SnippetBundle, run: list[str], *, narrow: bool = False) -> str:
+    """From feeds to actions by ``run``, which makes ``outputs`` (name → array) of ``feeds``.
+
+    ``narrow``: what is int64 in the contract is int32 in the file.
+    """
+    if narrow:
+        inputs = tuple(replace(s, dtype="int32") if s.dtype == "int64" else s for s in bundle.signature.inputs)
+        bundle = replace(bundle, signature=replace(bundle.signature, inputs=inputs))
+    before = bundle.beginnings("{} = {}  # {}", array)
     previous = bundle.previous
     lines = ["feeds = {"]
     for spec in bundle.signature.inputs:
-        lines += _entry(bundle, spec, _feed_expression(bundle, spec))
+        lines += _entry(bundle, spec, bundle.kept_variables.get(spec.name) or array(spec))
     lines += ["}", *run]
     for variable, head in zip(bundle.variables, bundle.heads, strict=True):
         lines += _action(bundle, variable, head)
@@ -97,31 +113,17 @@ def _entry(bundle: SnippetBundle, spec: TensorSpec, value: str) -> list[str]:
     return [*(f"    # {text}" for text in meaning(bundle, spec)), f"    {string_literal(spec.name)}: {value},"]
 
 
-def _feed_expression(bundle: SnippetBundle, spec: TensorSpec) -> str:
-    if spec.role is Role.NOISE:
-        return f"rng.standard_normal({_shape(example_shape(spec))}, {_dtype(spec)})"
-    return bundle.kept_variables.get(spec.name) or array(spec)
-
-
-def _draws(bundle: SnippetBundle) -> bool:
-    return bool(bundle.signature.noise) or any(h.role in ODDS for h in bundle.heads)
-
-
 def _action(bundle: SnippetBundle, variable: str, head: TensorSpec) -> list[str]:
     plain = bundle.plain(head)
     lines = [f"# {text}" for text in action_meaning(bundle, head)]
-    if plain != head:
-        lines.append(f"# deterministic: outputs[{string_literal(plain.name)}]")
-    output = f"outputs[{string_literal(head.name)}]"
-    if head.role not in ODDS:
+    output = f"outputs[{string_literal(plain.name)}]"
+    if plain.role not in ODDS:
         return [*lines, f"{variable} = {output}"]
-    scores = output if head.role is Role.LOG_PROBS else f"np.log({output})"
     ends = [sum(bundle.signature.branches[: i + 1]) for i in range(len(bundle.signature.branches) - 1)]
     return [
         *lines,
-        f"branches = np.split({scores}, {ends}, axis=1)  # log-probabilities",
-        "# a draw from each branch: the largest of log-probability + Gumbel noise",
-        f"{variable} = np.stack([(b + rng.gumbel(size=b.shape)).argmax(axis=1) for b in branches], axis=1)",
+        f"branches = np.split({output}, {ends}, axis=1)",
+        f"{variable} = np.stack([b.argmax(axis=1) for b in branches], axis=1)",
     ]
 
 

@@ -36,7 +36,7 @@ class Caller(Struct, frozen=True):
     @property
     def formats_text(self) -> str:
         """The formats that it needs, for people."""
-        return self.lacking_text(frozenset())
+        return "any format" if self.needs == _ANY else self.lacking_text(frozenset())
 
     def lacking_text(self, has: Collection[str]) -> str:
         """Those of its formats that a bundle lacks."""
@@ -90,7 +90,8 @@ TARGETS: tuple[Caller, ...] = (
 
 
 def _fill_code(found: Format, code: Code, bundle: SnippetBundle) -> str:
-    return Template(code.text).substitute(path=string_literal(bundle.path(found.main_of(bundle.name))))
+    play = python.play(bundle, ["outputs = policy(**feeds)"], narrow=found.narrow)
+    return Template(code.text).substitute(path=string_literal(bundle.path(found.main_of(bundle.name))), play=play)
 
 
 #: What people call the language of a snippet.

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 from msgspec import Struct
 
-from export_model.exporter.snippets.contract import SnippetBundle, branch_lines, number_names
+from export_model.exporter.snippets.contract import SnippetBundle, branch_lines, chance_text, number_names
 from export_model.signatures.roles import ACTION_SHAPE, IS_CONTINUOUS, MEMORY_SIZE, VERSION_NUMBER, Role
 from export_model.signatures.spec import TensorSpec
 
@@ -89,7 +89,8 @@ def _settings(bundle: SnippetBundle, able: Sequence[VersionSpan]) -> list[str]:
     lines += [f"  {s.name}: {', '.join(number_names(names[s.name]))}" for s in vectors if s.name in names]
     if "actions" in signature.labels:
         lines.append(f"  actions: {', '.join(number_names(signature.labels['actions']))}")
-    return [*lines, *(f"  {line}" for line in branch_lines(bundle))]
+    chance = "" if _action(bundle).is_continuous else chance_text(bundle, bundle.heads[0])
+    return [*lines, *(f"  {line}" for line in filter(None, [*branch_lines(bundle), chance]))]
 
 
 def _placeholders(bundle: SnippetBundle, scope: str) -> list[tuple[str, str]]:
@@ -136,9 +137,9 @@ def _brain(bundle: SnippetBundle, vectors: list[TensorSpec], images: list[Tensor
 
 
 def _action(bundle: SnippetBundle) -> TensorSpec:
-    """The node that CoreBrainInternal reads: float for continuous actions, int64 for discrete ones."""
+    """The node of the deterministic action, or of the one that the proposed noise of 0 makes so."""
     head = bundle.heads[0]
-    return head if head.is_continuous or head.dtype == "int64" else bundle.plain(head)
+    return head if head.is_continuous and bundle.signature.noise else bundle.plain(head)
 
 
 def _scope(bundle: SnippetBundle) -> str:

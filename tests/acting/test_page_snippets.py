@@ -85,8 +85,8 @@ def logs(out: Path) -> Callable[[str, str], list[Any]]:
 def test_what_a_page_is_told_gives_what_numpy_gives(
     name: str, target: str, out: Path, logs: Callable[[str, str], list[Any]]
 ) -> None:
-    policy = load_policy(out / name, runtime="numpy", seed=0)
-    agents = policy.agent(deterministic=target in ("tfjs", "onnxruntime-web"))
+    policy = load_policy(out / name, runtime="numpy")
+    agents = policy.agent(deterministic=True)
     zeros = {s.name: np.zeros([n or 1 for n in s.shape], s.dtype) for s in policy.signature.observations}
     lines = logs(target, name)
     assert len(lines) == (3 if name == "recurrent" else 1)
@@ -185,11 +185,9 @@ def test_node_runs_what_is_printed_for_it(name: str, target: str, out: Path, tmp
     (tmp_path / "node_modules").symlink_to((home / "node_modules").resolve())
     shutil.copytree(out / name, tmp_path / name)
     (tmp_path / "play.mjs").write_text(code_of(out, name, target), encoding="utf-8")
-    # One number for every class draws the likeliest; how the snippets draw is for test_drawing_snippets.py.
-    command = [node, "--import", "data:text/javascript,Math.random=()=>0.5", "play.mjs"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, encoding="utf-8", timeout=300)
+    done = subprocess.run([node, "play.mjs"], cwd=tmp_path, capture_output=True, encoding="utf-8", timeout=300)
     assert done.returncode == 0, done.stderr[-2000:]
-    agents = load_policy(out / name, runtime="numpy", seed=0).agent(deterministic=not target.startswith("policy"))
+    agents = load_policy(out / name, runtime="numpy").agent(deterministic=True)
     zeros = {s.name: np.zeros([n or 1 for n in s.shape], s.dtype) for s in agents.policy.signature.observations}
     lines = [line for line in done.stdout.splitlines() if line.startswith("[")]
     assert len(lines) == (3 if name == "recurrent" else 1)

@@ -19,14 +19,7 @@ import numpy as np
 from ai_edge_litert.interpreter import Interpreter
 
 policy = Interpreter($path).get_signature_runner("serving_default")
-# one agent (-1: any number of them); a mask's 1 allows an action; a memory's output is its input at the next step
-feeds = {
-    name: np.full([max(n, 1) for n in port["shape_signature"]], "mask" in name, port["dtype"])
-    for name, port in policy.get_input_details().items()
-}
-for name, value in policy(**feeds).items():
-    print(name, value)
-"""
+$play"""
 
 FORMATS = (
     Format(
