@@ -36,7 +36,7 @@ def read_labels(given: Labels | None) -> Mapping[str, Any] | None:
             f"--labels {path}: is neither JSON nor TOML", why=str(error)[:200], fix="correct the file"
         ) from error
     if not isinstance(content, dict):
-        raise UsageError(f"--labels {path}: must be a table", fix="see docs/acting.md for its form")
+        raise UsageError(f"--labels {path}: must be a table", fix="see docs/python-guide.md for its form")
     return content
 
 
@@ -48,7 +48,9 @@ def with_labels(policy: Policy, labels: Mapping[str, Any] | None, source: str = 
     if labels is not None and "policies" in labels:
         named = labels["policies"]
         if not isinstance(named, Mapping) or len(labels) > 1:
-            raise UsageError("labels: 'policies' stands alone and holds the labels by policy", fix="see docs/acting.md")
+            raise UsageError(
+                "labels: 'policies' stands alone and holds the labels by policy", fix="see docs/python-guide.md"
+            )
         labels = named.get(policy.name)
     if labels is None:
         return policy

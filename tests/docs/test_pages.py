@@ -20,13 +20,12 @@ from tests.docs.workshop import HOW, Workshop, furnish
 CORE_PAGES = ("README.md", "docs/start.md", "docs/unity.md", "docs/web.md", "docs/robots.md")
 #: Pages whose blocks have a test of their own.
 ELSEWHERE = {
-    "docs/live.md": "tests/live/test_docs.py",
-    "docs/acting.md": "tests/acting/test_docs.py",
+    "docs/python-guide.md": "tests/acting/test_docs.py",
     "docs/extending.md": "tests/docs/test_extending.py",
     **dict.fromkeys(CORE_PAGES, "tests/docs/test_core_pages.py"),
 }
 #: Pages that run with all runtimes.
-EVERY = {"docs/parity.md"}
+EVERY = {"docs/agreement.md"}
 #: Languages that stand for something to run; the rest is looked at.
 RUN = {"sh", "python", "js"}
 

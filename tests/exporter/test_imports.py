@@ -346,7 +346,7 @@ def test_the_package_loads_its_functions_when_they_are_asked_for() -> None:
 
 def test_help_of_every_documented_class_is_shown() -> None:
     """The signature of a Struct evaluates its annotations, in which names for type checking alone are missing."""
-    page = (ROOT / "docs/reference/python.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs/python-guide.md").read_text(encoding="utf-8")
     documented = re.findall(r"autoclass:: ([\w.]+)\.(\w+)", page)
     assert ("export_model.exporter.export.pipeline", "ExportResult") in documented
     for module, name in documented:

@@ -1,4 +1,4 @@
-"""The programs in docs/live.md run as they stand there."""
+"""The programs of the Python guide on training scripts run as they are printed."""
 
 from __future__ import annotations
 
@@ -18,11 +18,12 @@ from export_model.exporter.export.sources import read_source
 from fixtures import path as fixture
 from tests.commands import PYTHONPATH, ROOT, python
 
-PAGE = (ROOT / "docs/live.md").read_text(encoding="utf-8")
+GUIDE = (ROOT / "docs/python-guide.md").read_text(encoding="utf-8")
+PAGE = GUIDE.partition("\n## From a training script\n")[2].partition("\n## ")[0]
 #: Heading → the program under it.
 PROGRAMS = {
     text.partition("\n")[0]: match[1]
-    for text in PAGE.split("\n## ")[1:]
+    for text in PAGE.split("\n### ")[1:]
     if (match := re.search(r"```python\n(.*?)```", text, re.DOTALL))
 }
 WRITES = {"A session of TensorFlow 1": "Walker", "A tf.function": "Chooser", "A Keras model": "Runner"}

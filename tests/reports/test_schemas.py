@@ -64,7 +64,7 @@ def test_every_field_is_documented(name: str) -> None:
     """In the schema, which the pages name; a reference to a part that says it itself will do."""
     for where, part in properties(schema(name)):
         assert {"description", "$ref", "const"} & part.keys(), where
-    text = (ROOT / "docs" / "parity.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "agreement.md").read_text(encoding="utf-8")
     assert name not in ("parity", "policy") or f"{name}.schema.json" in text
 
 
