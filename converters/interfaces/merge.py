@@ -23,6 +23,12 @@ def merge(first: Interface, second: Interface) -> tuple[Interface, tuple[str, ..
         observations[name] = _terms(observations.get(name, ()), terms, notes)
     if first.period and second.period and abs(first.period.seconds - second.period.seconds) > 1e-6:
         notes.append(_difference("the control period", first.period.source, second.period.source))
+    other = [
+        key for key in first.metadata.keys() & second.metadata.keys() if first.metadata[key] != second.metadata[key]
+    ]
+    notes += [
+        f"metadata {key[:80]} is kept as the model has it; what is beside says otherwise" for key in sorted(other)
+    ]
     merged = Interface(
         observations=observations,
         actions=_terms(first.actions, second.actions, notes),

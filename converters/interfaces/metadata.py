@@ -2,11 +2,13 @@
 
 Sources: mjlab 1.6 (rl/exporter_utils.py: CSV with three decimals, ``;`` within an entry; tasks/tracking/rl/runner.py),
 whole_body_tracking (utils/exporter.py: the same without scales of observations, and ``observation_history_lengths``);
-forks write the same keys as JSON.
+forks write the same keys as JSON. Loaders ask for more: HybridRobotics/motion_tracking_controller@main
+(src/MotionOnnxPolicy.cpp and its base class) stops without ``anchor_body_name`` and ``body_names``.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from typing import Any
 
@@ -17,6 +19,11 @@ from export_model.signatures.interface import MAX_METADATA_CHARACTERS, MAX_TERMS
 FILE = "metadata_props"
 #: What only such exporters write; other metadata is kept and not read.
 _KNOWN = {"joint_names", "observation_names", "action_scale", "default_joint_pos"}
+#: Keys that exporters write and loaders ask for; a file of these is an interface, too.
+METADATA_KEYS = (
+    *("joint_names", "joint_stiffness", "joint_damping", "default_joint_pos", "action_scale", "command_names"),
+    *("observation_names", "observation_history_lengths", "anchor_body_name", "body_names", "run_path"),
+)
 #: Key → what its numbers are, one for each joint.
 _OF_JOINTS = {
     "joint_stiffness": "stiffness",
@@ -25,13 +32,24 @@ _OF_JOINTS = {
 }
 
 
-def read_metadata(given: Mapping[str, str]) -> Interface | None:
+def metadata_in(content: Mapping[str, Any]) -> dict[str, str]:
+    """The keys of a file that loaders ask for, as exporters write them: lists as CSV, tables as JSON."""
+    found = {}
+    for key in METADATA_KEYS:
+        value = content.get(key)
+        plain = isinstance(value, list) and not any(isinstance(v, list | dict) or "," in str(v) for v in value)
+        if value is not None:
+            found[key] = ",".join(map(str, value)) if plain else value if isinstance(value, str) else json.dumps(value)
+    return found
+
+
+def read_metadata(given: Mapping[str, str], file: str = FILE) -> Interface | None:
     """Return what a model's metadata states, with all of it unchanged; None where it has none, or beyond bounds."""
     if not given or sum(len(k) + len(v) for k, v in given.items()) > MAX_METADATA_CHARACTERS:
         return None
     if not _KNOWN & given.keys():
         return Interface(metadata=dict(given))
-    table = Table({key: _value(text) for key, text in given.items()}, FILE)
+    table = Table({key: _value(text) for key, text in given.items()}, file)
     joints = table.texts("joint_names")
     scale = table.numbers("action_scale")
     size = len(scale) if isinstance(table.value("action_scale"), list) else None

@@ -10,12 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from msgspec import Struct
+from msgspec.structs import replace
 
 from export_model.converters.files.fetch import inside, read_bytes
 from export_model.converters.files.yaml_data import MAX_YAML_BYTES, read_yaml
 from export_model.converters.interfaces.isaac_lab import read_agent, read_descriptors, read_environment
 from export_model.converters.interfaces.leapp import read_pipeline
 from export_model.converters.interfaces.merge import merge
+from export_model.converters.interfaces.metadata import METADATA_KEYS, metadata_in, read_metadata
 from export_model.converters.interfaces.mlagents import read_configuration
 from export_model.converters.interfaces.table import Table
 from export_model.converters.interfaces.unitree import read_deploy
@@ -25,6 +27,8 @@ from export_model.signatures.interface import Interface
 
 #: What ``--interface`` is given to leave out what lies beside a source.
 NO_INTERFACE = "none"
+#: Keys of ONNX metadata in a file, how alike a key or a name is to be called near, and what stands for no key.
+_METADATA, _ALIKE, _NO = "the keys of ONNX metadata", 0.7, ("", "", "-")
 #: Entries of a folder that are looked at.
 _MOST_ENTRIES = 2000
 #: The folder that Isaac Lab writes IO descriptors to.
@@ -148,23 +152,49 @@ def read_beside(source: Path, name: str | None, wanted: str | None) -> tuple[Int
 
 
 def read_interface(path: Path, model: str, behavior: str) -> Interface:
-    """Return what a file of one of the known kinds states, whatever its name.
+    """Return what a file of one of the known kinds states, whatever its name, with keys that loaders ask for.
 
-    Raises DamagedFileError, SourceError, RuntimeUnavailableError.
+    Raises DamagedFileError that names the nearest kind, SourceError, RuntimeUnavailableError.
     """
     content = read_yaml(read_bytes(path, empty=True, most=MAX_YAML_BYTES), path.name)
-    own = [k for k in FILES if fnmatchcase(path.name, k.pattern.replace("{folder}", path.absolute().parent.name))]
-    for kind in [*own, *(k for k in FILES if k not in own)]:
-        by_content = kind in own or (isinstance(content, dict) and kind.fits(content))
-        if isinstance(content, dict) and by_content and any(key in content for key in kind.keys):
-            return kind.read(Table(content, printable(path.name)), model, behavior)
-    known = ", ".join(kind.label for kind in FILES)
+    file = printable(path.name)
+    if isinstance(content, dict):
+        metadata = metadata_in(content)
+        rest = {key: value for key, value in content.items() if key not in metadata}
+        own = [k for k in FILES if fnmatchcase(path.name, k.pattern.replace("{folder}", path.absolute().parent.name))]
+        for kind in [*own, *(k for k in FILES if k not in own)]:
+            if any(key in rest for key in kind.keys) and (kind in own or kind.fits(rest)):
+                found = kind.read(Table(rest, file), model, behavior)
+                if kind in own or replace(found, kept=()):
+                    return replace(found, metadata={**found.metadata, **metadata})
+        if metadata and (stated := read_metadata(metadata, file)) is not None:
+            return replace(stated, kept=(*stated.kept, *Table(rest, file).rest()))
     raise DamagedFileError(
         "states no interface",
         where=str(path),
-        why="it has none of the keys of the known kinds",
-        fix=f"give one of {known}",
+        why=_nearest(content if isinstance(content, dict) else {}, path.name),
+        fix=f"give one of {', '.join(kind.label for kind in FILES)}, or keys of ONNX metadata",
     )
+
+
+def _nearest(content: Mapping[str, Any], name: str) -> str:
+    """Which known kind a file is most like, by its keys, else by its name."""
+    from difflib import SequenceMatcher  # not in every export: 2 ms
+
+    def alike(pair: tuple[str, str, str]) -> float:
+        return SequenceMatcher(None, pair[1], pair[2]).ratio()
+
+    keys = [str(key)[:60] for key in [*content][:200]]
+    kinds = [*((kind.label, kind.keys) for kind in FILES), (_METADATA, METADATA_KEYS)]
+    label, own, known = max(
+        ((kind, k, o) for kind, known in kinds for o in known for k in keys), key=alike, default=_NO
+    )
+    if alike((label, own, known)) >= _ALIKE:
+        same = f"it has {own}, but nothing in the form of that kind" if own == known else f"{own} may be {known}"
+        return f"the nearest kind is {label}: {printable(same)}"
+    label, own, known = max(((k.label, name, k.pattern) for k in FILES), key=alike)
+    nearest = f"; by its name it is nearest to {label}" if alike((label, own, known)) >= _ALIKE else ""
+    return f"it has none of the keys of the known kinds{nearest}"
 
 
 def _of_kind(kind: InterfaceFile, path: Path, model: str, behavior: str) -> Interface | None:

@@ -1,4 +1,4 @@
-"""``--robot FILE``: a user's own robot, as YAML or JSON: its joints, the pairs, what changes its sign."""
+"""``--robot FILE``: a user's own robot: its URDF or MJCF, or YAML with its joints, the pairs, what changes its sign."""
 
 from __future__ import annotations
 
@@ -8,10 +8,15 @@ from pathlib import Path
 from export_model.converters.files.fetch import read_bytes
 from export_model.converters.files.yaml_data import MAX_YAML_BYTES, read_yaml
 from export_model.converters.interfaces.table import Table
+from export_model.converters.layouts.pairing import mirror_pairs
+from export_model.converters.layouts.robot_xml import placed_joints
 from export_model.converters.layouts.robots import ROBOTS, Chain, Robot
+from export_model.converters.layouts.xml_data import MAX_XML_BYTES, read_xml
 from export_model.signatures.errors import DamagedFileError, UsageError, suggestion
 from export_model.signatures.fields import printable
 
+#: What URDF and MJCF files end with.
+_XML = (".urdf", ".xml", ".mjcf")
 _FORM = "joints: [a_left, a_right, waist]; pairs: [[a_left, a_right]]; turned: [waist] (what changes its sign)"
 
 
@@ -27,12 +32,18 @@ def robots_named(wanted: str | None) -> Sequence[Robot]:
     keys = [robot.key for robot in ROBOTS]
     raise UsageError(
         f"--robot {wanted}: no robot of that name is known",
-        fix=f"{suggestion(wanted, keys)}{', '.join(keys)}; or a file: {_FORM}",
+        fix=f"{suggestion(wanted, keys)}{', '.join(keys)}; or a file: a URDF, an MJCF, or {_FORM}",
     )
 
 
 def read_robot(path: Path) -> Robot:
-    """The robot of a file. Raises DamagedFileError where a joint is missing, or stands in two pairs."""
+    """The robot of a file.
+
+    Raises DamagedFileError where a joint is missing, or stands in two pairs, UsageError where a URDF or an MJCF leaves
+    open which joint is the mirror image of which.
+    """
+    if path.suffix.lower() in _XML:
+        return _read_model(path)
     table = Table(read_yaml(read_bytes(path, most=MAX_YAML_BYTES), path.name), printable(path.name))
     joints, turned = table.texts("joints"), table.texts("turned")
     pairs = table.value("pairs") or []
@@ -51,3 +62,11 @@ def read_robot(path: Path) -> Robot:
     told = {joint: (partners[joint], -1 if joint in turned else 1) for joint in joints}
     name = table.text("name") or path.stem
     return Robot(name, name, (Chain(joints),), (), (), printable(path.name), told=told)
+
+
+def _read_model(path: Path) -> Robot:
+    """The robot of a URDF or an MJCF."""
+    where = printable(path.name)
+    joints = placed_joints(read_xml(read_bytes(path, most=MAX_XML_BYTES), where), where)
+    chains = tuple(Chain((joint.name,), joint.above) for joint in joints)
+    return Robot(path.stem, path.stem, chains, (), (), where, told=mirror_pairs(joints, where))

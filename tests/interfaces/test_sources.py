@@ -23,6 +23,12 @@ def signature_of(path: Path, interface: str | None = None) -> PolicySignature:
     return policy.signature
 
 
+def interface_with(path: Path, file: Path) -> Interface:
+    found = signature_of(path, str(file)).interface
+    assert found is not None
+    return found
+
+
 def interface_of(path: Path) -> Interface:
     found = signature_of(path).interface
     assert found is not None
@@ -211,6 +217,63 @@ def test_a_file_that_cannot_be_read_is_a_note_and_one_that_was_named_an_error(tm
     assert signature_of(path).interface is None
     with pytest.raises(DamagedFileError, match="states no interface"):
         signature_of(path, str(bad))
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "nearest"),
+    [
+        ("mine.yaml", {"observation": {"a": 1}}, "observation may be observations"),
+        ("mine.yaml", {"anchor_body": "torso"}, "the keys of ONNX metadata: anchor_body may be anchor_body_name"),
+        ("mine.yaml", {"behaviours": {}}, "ML-Agents' configuration.yaml: behaviours may be behaviors"),
+        ("mine.yaml", {"observations": {"policy": 3}}, "it has observations, but nothing in the form of that kind"),
+        ("deploy2.yaml", {"q": 1}, "by its name it is nearest to Unitree's deploy.yaml"),
+        ("mine.json", [1], "has none of the keys of the known kinds"),
+    ],
+)
+def test_a_file_of_no_kind_is_an_error_that_names_the_nearest(
+    name: str, content: object, nearest: str, tmp_path: Path
+) -> None:
+    path = write_onnx(tmp_path / "policy.onnx")
+    (tmp_path / name).write_text(json.dumps(content))
+    with pytest.raises(DamagedFileError, match="states no interface") as caught:
+        signature_of(path, str(tmp_path / name))
+    assert nearest in str(caught.value)
+
+
+def test_keys_that_loaders_ask_for_are_kept_and_written(tmp_path: Path) -> None:
+    """HybridRobotics/motion_tracking_controller#25: a model without anchor_body_name is not loaded."""
+    onnx = pytest.importorskip("onnx")
+    path = write_onnx(tmp_path / "policy.onnx")
+    alone, both = tmp_path / "keys.yaml", tmp_path / "mine.yaml"
+    alone.write_text(json.dumps({"anchor_body_name": "torso_link", "body_names": ["pelvis", "torso_link"], "fps": 50}))
+    scales = {"observations": {}, "actions": {"Joint": {"scale": [0.5, 0.5]}}}
+    both.write_text(json.dumps({**scales, "anchor_body_name": "torso_link"}))
+    for file, more in ((alone, {"body_names": "pelvis,torso_link"}), (both, {})):
+        wanted = {"anchor_body_name": "torso_link", **more}
+        assert interface_with(path, file).metadata == wanted
+        assert (
+            export_model(
+                path, "-o", tmp_path / file.stem, "--interface", file, "--to", "onnx", "--verify", "none"
+            ).status
+            == 0
+        )
+        made = onnx.load(tmp_path / file.stem / "policy" / "policy.onnx")
+        assert wanted.items() <= {p.key: p.value for p in made.metadata_props}.items()
+        assert (
+            json.loads((tmp_path / file.stem / "policy" / "policy.json").read_text())["interface"]["metadata"] == wanted
+        )
+    assert [s.source for s in interface_with(path, alone).kept] == ["keys.yaml: fps"]
+    assert interface_with(path, both).actions[0].scale == (0.5, 0.5)
+
+
+def test_a_models_own_metadata_goes_before_keys_that_are_added(tmp_path: Path) -> None:
+    task = next(iter(MJLAB))
+    path = mjlab(tmp_path, task)
+    (tmp_path / "keys.yaml").write_text(json.dumps({"anchor_body_name": "torso_link", "joint_names": ["a", "b"]}))
+    signature = signature_of(path, str(tmp_path / "keys.yaml"))
+    assert signature.interface is not None
+    assert signature.interface.metadata == {**MJLAB[task]["metadata"], "anchor_body_name": "torso_link"}
+    assert any("metadata joint_names is kept as the model has it" in note for note in signature.notes)
 
 
 def test_what_lies_beside_may_be_left_out(tmp_path: Path) -> None:

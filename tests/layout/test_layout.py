@@ -200,20 +200,6 @@ def test_the_normaliser_tells_velocities_from_positions_and_gravity() -> None:
     assert "7.5 times" in found["evidence"][1]["says"]
 
 
-def test_a_robot_of_ones_own(tmp_path: Path) -> None:
-    pytest.importorskip("yaml")
-    go2 = next(r for r in ROBOTS if r.key == "go2")
-    joints = go2.all_orders()["level by level (Isaac Sim)"]
-    file = tmp_path / "dog.yaml"
-    pairs = [[j, go2.partner(j)] for j in joints if go2.partner(j) > j]
-    file.write_text(json.dumps({"joints": joints, "pairs": pairs, "turned": [j for j in joints if "hip" in j]}))
-    ran = export_model("layout", FOLDER / "walker.pt", "--robot", file, "--json")
-    assert (ran.status, ran.json["decided"]["robot, of those known"]) == (0, "dog")
-    file.write_text(json.dumps({"joints": joints, "pairs": [[*joints[:1], "tail"]]}))
-    is_refused(export_model("layout", FOLDER / "walker.pt", "--robot", file), "is not a robot's file", "pairs:")
-    is_refused(export_model("layout", FOLDER / "walker.pt", "--robot", "go3"), "no robot of that name", "did you mean")
-
-
 def test_an_onnx_and_a_bundle_are_told_alike(tmp_path: Path) -> None:
     assert export_model(FOLDER / "walker.pt", "-o", tmp_path, "--to", "onnx", "--verify", "none").status == 0
     scores = {
