@@ -61,7 +61,7 @@ def test_every_page_can_be_reached() -> None:
 
 def test_headings_are_found() -> None:
     assert "pytorch-checkpoints" in set(anchors(ROOT / "docs/sources.md"))
-    assert "../sources.md#pytorch-checkpoints" in links(ROOT / "docs/tasks/no-onnx.md")
+    assert "sources.md#pytorch-checkpoints" in links(ROOT / "docs/unity.md")
 
 
 def test_the_messages_of_the_faq_are_ones_that_are_said() -> None:
