@@ -90,6 +90,35 @@ def test_what_is_written_for_converters_is_the_same_to_the_bit(source: str, weig
         assert not {n.op for n in again.graph.nodes} & {"Sub"} - {n.op for n in whole.nodes}
 
 
+def test_a_graph_of_ours_with_an_input_lost_or_a_number_in_place_of_a_kernel_is_refused_by_its_node(
+    tmp_path: Path,
+) -> None:
+    """Where biases are added again nothing has been looked at yet: how many inputs, and of which rank."""
+    (result,) = export(
+        [FOLDER / "sb3_zip/ppo_box.zip"], ExportOptions(tmp_path, targets=("saved_model",), verify="none")
+    )
+    file = result.folder / "saved_model" / "saved_model.pb"
+    whole = file.read_bytes()
+    ops = [n.op for n in schema.parse(schema.SavedModel, whole, "model").meta_graphs[0].graph_def.node]
+    assert {"Sub", "MatMul"} <= set(ops)
+    for number, op in enumerate(ops):
+        if op not in ("Sub", "MatMul", "Const"):
+            continue
+        model = schema.parse(schema.SavedModel, whole, "model")
+        node = model.meta_graphs[0].graph_def.node[number]
+        if op != "Const":
+            del node.input[0]
+        elif len(node.attr["value"].tensor.tensor_shape.dim) == 2:
+            node.attr["value"].tensor.CopyFrom(schema.TensorProto(dtype=node.attr["dtype"].type, float_val=[0.5]))
+            node.attr["value"].tensor.tensor_shape.SetInParent()
+        else:
+            continue
+        file.write_bytes(schema.serialise(model))
+        with pytest.raises(ExportModelError) as refused:
+            read_source(file).policies()
+        assert "did not expect" not in str(refused.value), (node.name, refused.value)
+
+
 @pytest.mark.corpus
 @pytest.mark.slow
 def test_the_contract_of_every_kind_of_public_and_genuine_graph_is_kept(

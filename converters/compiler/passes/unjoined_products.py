@@ -48,11 +48,12 @@ def rejoin_biases(graph: Graph) -> Graph:
 
 
 def _subtracted_bias(graph: Graph, node: Node) -> np.ndarray | None:
-    """What a ``Sub`` takes off a product of a known width, a number of each column."""
-    product = _product(graph, node) if node.op == "Sub" else None
-    kernel = None if product is None else graph.constant(product.inputs[1])
-    bias = None if product is None else graph.constant(node.inputs[1])
-    if product is None or kernel is None or bias is None:
+    """What a ``Sub`` takes off a product of a known width, a number of each column; a damaged one takes nothing off."""
+    product = _product(graph, node) if node.op == "Sub" and len(node.inputs) == 2 else None
+    if product is None or len(product.inputs) != 2:
+        return None
+    kernel, bias = (graph.constant(each.inputs[1]) for each in (product, node))
+    if kernel is None or kernel.ndim < 2 or bias is None:
         return None
     return bias if bias.shape == (kernel.shape[0 if product.attrs.get("transpose_b") else -1],) else None
 
