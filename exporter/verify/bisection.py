@@ -25,7 +25,7 @@ from export_model.converters.graph.ops.samplers import SAMPLERS
 from export_model.converters.graph.ops.table import traits
 from export_model.converters.graph.run import run_graph
 from export_model.converters.runtimes.pool import RuntimePool
-from export_model.exporter.verify.difference import Difference, compare
+from export_model.exporter.verify.difference import ONE_SIDED, Difference, compare
 from export_model.exporter.verify.findings import Bisection
 from export_model.exporter.verify.inner_tensors import inner_tensors, outputs_read
 from export_model.exporter.verify.participants import Feeds, Participant, PolicyUnderTest
@@ -164,6 +164,13 @@ class Bisector:
         return node.origin
 
 
+class _Suspect(Struct, frozen=True):
+    """A tensor with a NaN or infinity on one side, and those that differ because of it: what reads it may clip it."""
+
+    begins: Bisection
+    reached: set[str]
+
+
 class _Search(Struct, frozen=True, eq=False):
     graph: Graph
     candidate: InnerTensors
@@ -180,18 +187,34 @@ class _Search(Struct, frozen=True, eq=False):
         read = outputs_read([n.name for n in nodes], [output, *(r for n in nodes for r in n.inputs)])
         tensors = [t for n in nodes if n.name not in drawn for t in read[n.name]]
         expected = run_graph(self.graph, self.feeds, tensors)
-        seen: set[str] = set()
-        for chunk in _chunks(tensors, expected):
-            got = self._fetch(chunk)
-            seen |= got.keys()
-            for tensor in chunk:
-                if tensor in got and (found := self._wrong(tensor, expected[tensor], got[tensor], seen)) is not None:
-                    return found
+        if (begins := self._begin(tensors, expected, output)) is not None:
+            return begins
         if samplers:  # one for each branch, in their order; a joint one for all
             sampler = samplers[min(branch, len(samplers) - 1)]
             reason = "what it draws from agrees, what it draws does not"
             return Bisection(sampler.name, sampler.op, self.source(sampler), reason=reason)
         return Bisection(None, reason="no tensor that leads to it differs by more than the tolerance")
+
+    def _begin(self, tensors: Sequence[str], expected: Feeds, output: str) -> Bisection | None:
+        """The first of ``tensors`` that differs; with a NaN or infinity on one side, one that reaches ``output``."""
+        seen: set[str] = set()
+        suspects: list[_Suspect] = []
+        for chunk in _chunks(tensors, expected):
+            got = self._fetch(chunk)
+            seen |= got.keys()
+            for tensor in chunk:
+                found = self._wrong(tensor, expected[tensor], got[tensor], seen) if tensor in got else None
+                if tensor in got and found is None:
+                    continue
+                inputs = self.graph.producer(tensor).inputs
+                behind = [s for s in suspects if not s.reached.isdisjoint(inputs)]
+                for suspect in behind:
+                    suspect.reached.add(tensor)
+                if found is not None and not behind:
+                    suspects.append(_Suspect(found, {tensor}))
+                if found is not None and suspects[0].begins.reason != ONE_SIDED:
+                    return suspects[0].begins
+        return next((s.begins for s in suspects if output in s.reached), suspects[0].begins if suspects else None)
 
     def _fetch(self, tensors: Sequence[str]) -> dict[str, np.ndarray]:
         """The candidate's values; one that it cannot give is left out, as one that it has not."""

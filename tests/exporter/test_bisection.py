@@ -17,7 +17,8 @@ from export_model.converters.formats.embed import runnable
 from export_model.converters.formats.frozen_graph.reader import read_graph
 from export_model.converters.formats.intermediate_tensors import InnerTensors, View
 from export_model.converters.formats.onnx.tensor_map import TensorMap, loads
-from export_model.converters.graph.nodes import Graph, Node
+from export_model.converters.graph.builder import Builder
+from export_model.converters.graph.nodes import Graph, NameScope, Node, TensorShape
 from export_model.converters.graph.run import run_graph
 from export_model.converters.policy.policy import Policy
 from export_model.exporter.export.pipeline import ExportOptions, export
@@ -155,6 +156,26 @@ def test_a_nan_is_a_difference(policies: dict[str, Policy]) -> None:
     assert (entry["tensor"], entry["got"], entry["max_abs_diff"]) == ("mul", "nan", "inf")
     assert entry["smallest_tolerance"] is None
     assert entry["reason"] == "NaN or infinity on one side only"
+
+
+def ratio(ceiling: float) -> Graph:
+    """The logarithm of a ratio that is clipped, beside a sum."""
+    b = Builder(NameScope(()))
+    b.append(Node("x", "Placeholder", (), {"dtype": np.dtype(np.float32), "shape": TensorShape((None, 2))}))
+    b.add("RealDiv", [b.number("x", 1), "x"], "ratio")
+    b.add("Log", [b.add("Minimum", ["ratio", b.number("x", ceiling)], "clipped")], "logarithm")
+    b.add("Add", ["logarithm", "x"], "action")
+    return b.graph()
+
+
+def test_an_infinity_that_what_reads_it_takes_away_is_not_where_it_begins() -> None:
+    """1/0 in place of 1/1e-9: both are clipped to 100, and it is the sum that differs."""
+    feeds = {"x": np.full((1, 2), 1e-9, np.float32)}
+    infinite = spoilt(ratio(100), "ratio", float("inf"))
+    assert searched(ratio(100), spoilt(infinite, "action"), feeds, "action").tensor == "action"
+    assert searched(ratio(100), spoilt(infinite, "action", float("nan")), feeds, "action").tensor == "action"
+    found = searched(ratio(1e30), spoilt(ratio(1e30), "ratio", float("inf")), feeds, "action")  # clipped to another
+    assert (found.tensor, found.reason) == ("ratio", "NaN or infinity on one side only")
 
 
 def test_what_a_runtime_refuses_to_give_is_left_out(policies: dict[str, Policy]) -> None:

@@ -25,7 +25,7 @@ from export_model.exporter.reports.summary import failure_lines
 from export_model.exporter.verify.options import VerifyOptions
 from export_model.signatures.contract import parse
 from export_model.signatures.errors import UnsupportedOpError
-from fixtures import FIXTURES, path
+from fixtures import FIXTURES, FOLDER, path
 from tests import known
 from tests.comparing import compare_artefacts
 from tests.conftest import Chosen
@@ -63,6 +63,19 @@ def test_fixtures_agree_under_both_signatures(name: str, tmp_path: Path, here: R
         assert ran >= {("litert", runtime) for runtime in LITERT}
         assert ran >= {("litert:deterministic", runtime) for runtime in LITERT}
         assert {p.name for p in result.folder.iterdir()} >= {f"{result.policy.name}.tflite", "policy.json"}
+
+
+def test_what_litert_computes_otherwise_at_the_ends_of_float32_is_named(tmp_path: Path, here: RuntimePool) -> None:
+    """An exponential of observations of 1e4: what a user sees is which tensor, where and what LiteRT made of it."""
+    source = FOLDER / "torchscript" / "shrunk_trace.pt"
+    options = ExportOptions(tmp_path, ("litert",), verify="litert,litert-plain")
+    (result,) = export([source], options, pool=here)
+    assert result.report is not None and result.report.passed is False
+    found = {f.runtime: f.bisection for f in result.report.failures if f.format == "litert" and f.bisection is not None}
+    assert [(r, b.op, str(b.expected), str(b.got)) for r, b in sorted(found.items())] == [
+        ("litert", "Sigmoid", "1.0", "nan"),  # expected 1: no rounding, no fault of the file
+        ("litert-plain", "Sub", "inf", "3.4028234663852886e+38"),
+    ]
 
 
 @pytest.mark.parametrize("name", THEIR_SIZES)
