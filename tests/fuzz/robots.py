@@ -48,9 +48,10 @@ def runs() -> list[Files]:
 def change_run(files: Files, random: Random) -> Files:
     """Change the settings as a tree or as bytes, or the checkpoint."""
     draw = random.random()
-    if draw < 0.3:
+    settings = [n for n in files if n != "policy.pt"]  # FastTD3 has none
+    if draw < 0.3 or not settings:
         return {**files, **changes.pickled({"policy.pt": files["policy.pt"]}, random)}
-    (name,) = (n for n in files if n != "policy.pt")
+    (name,) = settings
     data = files[name]
     if draw < 0.8:
         tree = mutation.json_tree(yaml.safe_load(data), random)

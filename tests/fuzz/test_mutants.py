@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from random import Random
 
 import pytest
 
@@ -15,6 +16,14 @@ pytestmark = [
 ]
 #: Of each reader.
 COUNT = 20
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_every_seed_of_a_reader_can_be_changed(reader: str) -> None:
+    """A seed that ends the tool is one whose reader was never tried."""
+    change, random = READERS[reader].change, Random(reader)
+    for seed in READERS[reader].seeds():
+        assert all(change(seed, random) for _ in range(4))
 
 
 def test_mutants_are_converted_or_refused() -> None:
