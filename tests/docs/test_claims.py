@@ -15,6 +15,7 @@ from export_model.converters.consumers.profiles import PROFILES, profile
 from export_model.converters.formats.registry import WRITTEN
 from export_model.exporter.cli.app import app
 from export_model.exporter.demo import BALL
+from export_model.exporter.export.sources import read_source
 from export_model.exporter.snippets.registry import TARGETS
 from export_model.exporter.verify import cut, rounding, statistics
 from export_model.exporter.verify.checks import decisions, densities, draws, mixed
@@ -23,9 +24,12 @@ from export_model.exporter.verify.options import VerifyOptions
 from export_model.exporter.verify.tolerances import ATOL, RTOL, Tolerance, tolerance_for
 from export_model.exporter.verify.work import SECONDS
 from export_model.signatures.errors import ParityError, RuntimeUnavailableError, SourceError, UsageError
-from export_model.signatures.sampling import HUGE_BATCH, LARGE_BATCH, MOST_IDS
+from export_model.signatures.masks import MOST_FORBIDDEN
+from export_model.signatures.sampling import HUGE_BATCH, LARGE_BATCH, MOST_IDS, draw_cases
+from fixtures import path
 from tests.commands import ROOT, export_model
 from tests.docs.blocks import name_of, pages
+from tests.faults.judging import ROWS
 from tests.support_tables import section
 
 #: Options of other programs that the pages show.
@@ -107,6 +111,59 @@ def test_the_figures_of_agreement_are_those_of_the_program() -> None:
     formats = prose(ROOT / "docs" / "formats.md")
     assert decisions.LIMITS == {"float16": 0.01, "int8": 0.05}
     assert "at most 1% (float16) or 5% (int8) of the choices" in formats
+
+
+#: What docs/agreement.md says in figures before its part on reports, and where it is held to what is.
+HELD_BY = {
+    r"status 3 with `--require all`": "tests/reports/test_partial.py",
+    r"NOT VERIFIED with the reason \(status 3\)": "tests/exporter/test_verdicts.py",
+    r"N\(0, 1\); zeros; the ±5 clip and beyond; 8 to 10,000": "test_the_inputs_of_agreement_are_those_that_are_drawn",
+    r"\(with noise up to ±6\)|\(N\(0, 1\), and up to ±6\)": "test_the_inputs_of_agreement_are_those_that_are_drawn",
+    r"batches of 1 to 5, .* alone one of 4,096": "test_the_inputs_of_agreement_are_those_that_are_drawn",
+    r"\(1, 2, 7, 32, 64 and 67 with images": "test_the_inputs_of_agreement_are_those_that_are_drawn",
+    r"\(64 actions at most\)|no more than 512": "test_the_inputs_of_agreement_are_those_that_are_drawn",
+    r"unknown tables get 0 and 1": "tests/verify/test_inputs.py",
+    r"about 20 seconds of inputs and 20 of draws": "test_the_figures_of_agreement_are_those_of_the_program",
+    r"with 1e-5 for both|within 1e-5 (of the best one's|or rounding)": "test_the_rule_is_the_one_that_is_applied",
+    r"no int64: int32 there": "tests/verify/test_bounds.py",
+    r"2⁻¹⁷ of the number itself|`action_probs` \(5e-3\)": "test_the_figures_of_agreement_are_those_of_the_program",
+    r"n·2⁻¹²⁶ of .* or 0 \||numbers below 2⁻¹²⁶": "tests/faults/test_excuses.py",
+    r"log\(sigmoid\(−30\)\)|log\(0\) − log\(0\)": "tests/faults/test_excuses.py",
+    r"in 10⁹|4096 rows of many inputs in one batch \(1024": "test_the_figures_of_agreement_are_those_of_the_program",
+    r"once in 10⁶ times|\(below 1e-9\)": "test_the_figures_of_agreement_are_those_of_the_program",
+    r"4096 draws \(a .* by 0\.012\)|512 for each of eight": "test_the_figures_of_agreement_are_those_of_the_program",
+    r"noise must be N\(0, 1\)": "tests/acting",
+    r"an output × 0|4,096 of the policy's own inputs": "test_the_inputs_of_agreement_are_those_that_are_drawn",
+    r"all 155 model files of the genuine cases \(87 .*, 24 `\.onnx`\)": "tests/corpus/test_every_frozen_graph.py",
+    r"log\(1 − tanh² \+ ε\)|float(32|64)": "tests/docs/test_claims.py",  # names
+}
+
+
+def test_every_figure_of_agreement_is_held() -> None:
+    text = (ROOT / "docs" / "agreement.md").read_text(encoding="utf-8").partition("## Reports")[0]
+    text = " ".join(re.sub(r"```.*?```|\]\([^)]*\)", "", text, flags=re.DOTALL).split())
+    for claim, test in HELD_BY.items():
+        text, times = re.subn(claim, "", text)
+        assert times, f"the page no longer says {claim}"
+        assert test in globals() or (ROOT / test).exists(), test
+    assert not re.findall(r"\S*\d\S*", text)
+
+
+def test_the_inputs_of_agreement_are_those_that_are_drawn() -> None:
+    text = prose(ROOT / "docs" / "agreement.md")
+    said = re.search(r"batches of 1 to 5, ([\d, and]+), and of .* rows \(([\d, and]+) with images", text)
+    assert said is not None
+    for fixture, batches in (("continuous", f"1, 2, 3, 4, 5, {said[1]}, {HUGE_BATCH}"), ("visual", said[2])):
+        (policy,) = read_source(path(fixture)).policies()
+        cases = {c.name: c for c in draw_cases(policy.signature)}
+        assert {int(n) for n in re.findall(r"\d+", batches)} <= {c.batch for c in cases.values()}
+        greatest = {name: {k: np.abs(v).max() for k, v in case.feeds.items()} for name, case in cases.items()}
+        assert greatest["zeros"]["state"] == 0
+        assert 5 <= greatest["clip edges"]["state"] < greatest["beyond the clip"]["state"]
+        assert 1e3 < greatest["8 to 1e4"]["state"] <= 1e4
+        assert max(g["epsilon"] for g in greatest.values()) == pytest.approx(6, abs=0.1)
+    assert f"({MOST_FORBIDDEN} actions at most)" in text
+    assert f"at {ROWS:,} of the policy's own inputs" in text
 
 
 def test_the_exception_is_as_the_page_says() -> None:
