@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import datetime
+import itertools
 import json
 import statistics
 import sys
@@ -37,6 +38,8 @@ from tests.faults.page import section
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 FIGURES, PAGE = DOCS / "figures.json", DOCS / "figures.md"
+#: Where the part of the page begins that this does not write.
+REST = "## Speed and size\n"
 KINDS = {
     "continuous": "continuous actions, vectors only",
     "discrete": "discrete actions, vectors only",
@@ -211,7 +214,7 @@ def page(content: Mapping[str, Any]) -> str:
     lines = [
         "# Figures",
         "",
-        "<!-- Written by: python -m tests.figures. Do not edit. -->",
+        "<!-- Written by: python -m tests.figures, down to the part on speed. Do not edit. -->",
         "",
         f"Measured on {content['date']} by `python -m tests.figures`: {content['files']} frozen graphs, which are "
         f"{sum(origins.values())} policies ({origins.get('genuine', 0)} written by the trainers of "
@@ -246,26 +249,36 @@ def page(content: Mapping[str, Any]) -> str:
         ),
         "## Draws",
         "",
-        "Actions drawn inside the graph are held against their distribution; the false alarm rate is 1e-6 a test.",
+        "Actions drawn inside the graph are held against their distribution; the false alarm rate is 1e-6 a test. The "
+        f"smallest p: {'; '.join(_draws(cells, kinds, rows))}.",
         "",
-        *_table(
-            ["format", "runtime", "tests", "smallest p"],
-            [
-                [f, r, sum(c["draws"] for c in drawn), _number(min(c["least_p"] for c in drawn))]
-                for f, r in rows
-                if (drawn := [cells[k, f, r] for k in kinds if (k, f, r) in cells and cells[k, f, r]["draws"]])
-            ],
-        ),
-        "## Runtimes",
+        f"**Runtimes.** {', '.join(f'{r} {v}' for r, v in content['runtimes'].items())}.",
         "",
-        *_table(["runtime", "version"], [[r, v] for r, v in content["runtimes"].items()]),
         *(_profiles(content["unity"]) if "unity" in content else []),
         *(_litert(content["litert"]) if "litert" in content else []),
         *(_litert_web(content["litert-web"]) if "litert-web" in content else []),
         *(_programs(content["programs"]) if "programs" in content else []),
         *(section(content["faults"]) if "faults" in content else []),
     ]
-    return "\n".join(lines).rstrip() + "\n"
+    return "\n".join(lines).rstrip() + "\n\n"
+
+
+def _draws(
+    cells: Mapping[tuple[str, str, str], Mapping[str, Any]], kinds: Sequence[str], rows: Sequence[tuple[str, str]]
+) -> Iterator[str]:
+    """Of each format, how many tests there were in each runtime, and the smallest p."""
+    for format, of in itertools.groupby(rows, lambda row: row[0]):
+        drawn = {r: [c for k in kinds if (c := cells.get((k, format, r))) and c["draws"]] for _, r in of}
+        tests = {sum(c["draws"] for c in found) for found in drawn.values() if found}
+        least = (f"{r} {_number(min(c['least_p'] for c in found))}" for r, found in drawn.items() if found)
+        if tests:
+            yield f"{format} ({' or '.join(map(str, sorted(tests)))} tests each) {', '.join(least)}"
+
+
+def write(content: Mapping[str, Any]) -> None:
+    """Put the figures into the page, and leave the rest of it."""
+    text = PAGE.read_text(encoding="utf-8")
+    PAGE.write_text(page(content) + text[text.index(REST) :], encoding="utf-8")
 
 
 def _profiles(counted: Mapping[str, Any]) -> list[str]:
@@ -421,7 +434,7 @@ def main() -> int:
         kept = {key: before[key] for key in ("unity", "litert", "litert-web", "programs", "faults") if key in before}
         FIGURES.write_text(json.dumps({**content, **kept}, indent=1) + "\n", encoding="utf-8")
     content = json.loads(FIGURES.read_text(encoding="utf-8"))
-    PAGE.write_text(page(content), encoding="utf-8")
+    write(content)
     print(f"wrote {PAGE.relative_to(DOCS.parent)}; failed: {', '.join(content['failed']) or 'none'}")
     return 1 if content["failed"] else 0
 

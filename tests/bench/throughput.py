@@ -29,7 +29,7 @@ from tests.bench.plot import Line, plot
 
 ROOT = Path(__file__).resolve().parents[2]
 SHARED = ROOT.parent / "shared"
-PAGE, PLOT = ROOT / "docs" / "performance.md", ROOT / "docs" / "pictures" / "throughput.svg"
+PAGE, PLOT = ROOT / "docs" / "figures.md", ROOT / "docs" / "pictures" / "throughput.svg"
 BEGIN, END = "<!-- throughput: written by python -m tests.bench.throughput --write -->\n", "<!-- /throughput -->\n"
 #: Numbers of policies at which memory is looked at.
 MARKS = (200, 1000, 2000)

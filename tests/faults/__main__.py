@@ -24,7 +24,7 @@ from export_model.signatures.errors import ExportModelError
 from tests.faults.families import Member, members, shared
 from tests.faults.judging import Fault, Outcome, Subject
 from tests.faults.page import totals
-from tests.figures import FIGURES, PAGE, page
+from tests.figures import FIGURES, write
 
 #: Faults of a member of the sample.
 SAMPLED = 3
@@ -128,7 +128,7 @@ def main() -> int:
         before = json.loads(FIGURES.read_text(encoding="utf-8"))
         kept = {**before, "faults": content}
         FIGURES.write_text(json.dumps(kept, indent=1) + "\n", encoding="utf-8")
-        PAGE.write_text(page(kept), encoding="utf-8")
+        write(kept)
     caught, located, planted = totals(content)
     print(
         f"{planted} faults in {content['policies']} policies: {caught} caught, {located} located, "

@@ -31,7 +31,7 @@ distributed = pytest.importorskip("distributed")
 pytestmark = pytest.mark.runtimes
 
 NAMES = ("continuous", "discrete", "twobrains", "recurrent")
-#: Four sources each, which are five policies; 400 are the 2,000 that docs/performance.md tells of.
+#: Four sources each, which are five policies; 400 are the 2,000 that docs/figures.md tells of.
 COPIES = int(os.environ.get("EXPORT_MODEL_TEST_COPIES", "6"))
 
 
