@@ -23,6 +23,7 @@ ROOMS = (
     "js",
     "stable_baselines3",
     "rllib",
+    "brax",
     "torchscript",
     "torch_checkpoint",
     "keras",

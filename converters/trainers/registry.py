@@ -13,6 +13,7 @@ from export_model.signatures.errors import NotAPolicyError, UsageError
 #: Rooms of ``converters/trainers``, in the order in which they are asked.
 ROOMS = (
     "rllib",
+    "brax",
     "stable_baselines3",
     "mlagents",
     "fast_td3",

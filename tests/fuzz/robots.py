@@ -12,6 +12,7 @@ from random import Random
 
 import yaml
 
+from fixtures.brax import FOLDER as BRAX
 from fixtures.robots import FOLDER
 from tests.fuzz import changes, mutation
 from tests.fuzz.changes import Files
@@ -79,6 +80,23 @@ def change_module(files: Files, random: Random) -> Files:
     if random.random() < 0.8:
         return {**files, name: mutation.parts(changes.opcodes(files[name]), random, changes.opcode)}
     return {**files, name: mutation.damaged(files[name], random)}
+
+
+def brax_pickles() -> list[Files]:
+    """Return parameters that brax saved, each beside a configuration."""
+    config = (BRAX / "ppo_orbax" / "ppo_network_config.json").read_bytes()
+    return [{"params.pkl": f.read_bytes(), "ppo_network_config.json": config} for f in sorted(BRAX.glob("*.pkl"))]
+
+
+def change_brax(files: Files, random: Random) -> Files:
+    """Change the pickle by its opcodes or its bytes, or the configuration as a tree."""
+    draw = random.random()
+    if draw < 0.6:
+        return {**files, "params.pkl": mutation.parts(changes.opcodes(files["params.pkl"]), random, changes.opcode)}
+    if draw < 0.8:
+        return {**files, "params.pkl": mutation.damaged(files["params.pkl"], random)}
+    tree = mutation.json_tree(json.loads(files["ppo_network_config.json"]), random)
+    return {**files, "ppo_network_config.json": json.dumps(tree).encode("utf-8", "surrogatepass")}
 
 
 def saved_policies() -> list[Files]:

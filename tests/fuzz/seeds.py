@@ -351,6 +351,7 @@ def _tables() -> Iterator[tuple[str, Reader]]:
     yield "Stable-Baselines3", Reader(_saved_zips, changes.saved_zip, "policy.zip")
     yield "robots' runs", Reader(robots.runs, robots.change_run, "policy.pt")
     yield "RLlib", Reader(robots.modules, robots.change_module)
+    yield "brax", Reader(robots.brax_pickles, robots.change_brax, "params.pkl")
     yield "SBX", Reader(robots.saved_policies, robots.change_saved_policy, "policy.zip")
     yield "VecNormalize", Reader(_normalised, changes.statistics, "policy.zip")
     yield "bundle", Reader(_bundles, changes.bundle, takes="bundle")
