@@ -47,10 +47,10 @@ def check_options(found: Format, path: Path, options: ReadOptions) -> None:
     for option, fix in _TAKEN:
         if getattr(options, option) not in (None, ()) and option not in found.takes:
             raise UsageError(
-                f"{options.flags}{option} says nothing about this source",
+                f"--{option} says nothing about this source",
                 where=str(path),
                 why=f"it is {found.label}",
-                fix=f"leave {options.flags}{option} out, or give {fix}",
+                fix=f"leave --{option} out, or give {fix}",
             )
 
 

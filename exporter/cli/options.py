@@ -201,8 +201,12 @@ def reading_candidates(command: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(command)
     def parse_and_call(*args: Any, trust_source: bool, **rest: Any) -> Any:
+        from export_model.exporter.compare.reading import naming_candidates_options
+
         told = {row.name: rest.pop(f"{CANDIDATE}{row.name}") for row in rows}
-        return command(*args, trust_source=trust_source, **collect(trust_source=trust_source, **told), **rest)
+        with naming_candidates_options():
+            collected = collect(trust_source=trust_source, **told)
+        return command(*args, trust_source=trust_source, **collected, **rest)
 
     made: Callable[..., Any] = parse_and_call
     for row in rows:

@@ -170,7 +170,6 @@ def _reading(
     """Read a candidate; None for a bundle's, whose names are the canonical ones, and where it can only be fed."""
     if not artefact.format.readable or (artefact.place / POLICY).is_file():
         return None
-    read = replace(read or ReadOptions(), flags="--candidate-")
     try:
         return read_candidate(label, artefact.place, policy, read, understanding, names)
     except UsageError:

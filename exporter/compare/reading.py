@@ -6,7 +6,9 @@ its tensors take (exporter/verify/original.py); one that no runtime loads by its
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +28,7 @@ from export_model.exporter.compare.pairing import Pairing, axes_to, pair_policie
 from export_model.exporter.export.sources import read_source
 from export_model.exporter.verify.original import Original
 from export_model.exporter.verify.participants import Failure, Feeds, Participant
-from export_model.signatures.errors import SourceError
+from export_model.signatures.errors import ExportModelError, SourceError
 from export_model.signatures.interface import Interface
 from export_model.signatures.roles import Role
 from export_model.signatures.spec import TensorSpec
@@ -35,6 +37,21 @@ from export_model.signatures.spec import TensorSpec
 _WRITTEN_AS = (ONNX, FROZEN_GRAPH)
 #: Inputs that only the candidate has, and what says nothing in each: no noise, every action allowed.
 _NEUTRAL = {Role.NOISE: 0.0, Role.MASKS: 1.0}
+#: Options that each side of a comparison has its own of (exporter/cli/rows.py); the reference's have no prefix.
+APART = (
+    "step",
+    "brain",
+    "input",
+    "output",
+    "set",
+    "sensors",
+    "activation",
+    "script",
+    "repair",
+    "normaliser",
+    "interface",
+)
+_FLAG = re.compile(rf"(?<![\w-])--({'|'.join(APART)})(?![\w-])")
 
 
 class ReadCandidate(Struct, frozen=True):
@@ -160,17 +177,30 @@ def read_candidate(
     names: Mapping[str, str],
 ) -> ReadCandidate:
     """Read a file as the policy it holds. Raises ExportModelError, SourceError where it holds several."""
-    source = read_source(path, read)
-    found = list(source.compile_models(understanding))
-    if len(found) > 1:
-        raise SourceError(
-            f"the candidate holds {len(found)} policies",
-            where=str(path),
-            why=", ".join(p.name for _, p in found),
-            fix="choose one with --candidate-brain, or give one model of it",
-        )
+    with naming_candidates_options():
+        source = read_source(path, read)
+        found = list(source.compile_models(understanding))
+        if len(found) > 1:
+            raise SourceError(
+                f"the candidate holds {len(found)} policies",
+                where=str(path),
+                why=", ".join(p.name for _, p in found),
+                fix="choose one with --brain, or give one model of it",
+            )
     model, policy = found[0]
     return ReadCandidate(label, source.format, path, policy, model.original, pair_policies(reference, policy, names))
+
+
+@contextmanager
+def naming_candidates_options() -> Iterator[None]:
+    """Let an error name the options of candidates in the place of the reference's."""
+    try:
+        yield
+    except ExportModelError as error:
+        error.what = _FLAG.sub(r"--candidate-\1", error.what)
+        error.why, error.fix = (t and _FLAG.sub(r"--candidate-\1", t) for t in (error.why, error.fix))
+        error.args = (error.message,)
+        raise
 
 
 def read_participants(
