@@ -42,7 +42,7 @@ class ReadOptions(Struct, frozen=True, kw_only=True):
     normaliser: Path | str | None = None
     #: File that states the interface (default: those next to the source), or ``"none"`` to leave it out.
     interface: Path | str | None = None
-    #: Let Keras load what is not plain data. It can run code.
+    #: Let Keras or PyTorch load what is not plain data. It can run code.
     trust_source: bool = False
 
     def for_reader(self) -> source.ReadOptions:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from msgspec import Struct, field
 from msgspec.structs import replace
@@ -18,6 +18,9 @@ from export_model.converters.graph.nodes import Graph
 from export_model.converters.policy.facts import SourceFacts
 from export_model.signatures.errors import ExportModelError
 from export_model.signatures.spec import SourceMap
+
+if TYPE_CHECKING:
+    from export_model.converters.trainers.trainer import Modules
 
 #: An option of a run for which a child imports TensorFlow's Python first, more than what a file from anyone may take;
 #: the model is the user's own.
@@ -77,6 +80,13 @@ class OriginalRun(Struct, frozen=True):
             yield str(file), {"kind": "graph", "source": True}
 
 
+def run_of(path: Path, modules: Modules | None) -> OriginalRun | None:
+    """How PyTorch runs a trainer's network, of the state that was read as data; None where it is not built there."""
+    if modules is None:
+        return None
+    return OriginalRun("torch", path, {"kind": modules.kind, **modules.told}, copy=modules.write)
+
+
 class SourceModel(Struct, frozen=True):
     """One model of a source (a run folder has one per behavior; a graph may still hold several brains).
 
@@ -112,7 +122,6 @@ class ReadOptions(Struct, frozen=True):
       source; ``NO_NORMALISER``: they are left out).
     - ``script``: which script saved a state dictionary.
     - ``repair``: which fault of an ONNX model's exporter is mended.
-    - ``flags``: how the options begin on the command line, for errors.
     - ``interface``: the file that states the interface (None: those beside the source; "none": none).
     """
 
@@ -125,4 +134,3 @@ class ReadOptions(Struct, frozen=True):
     interface: str | None = None
     script: str | None = None
     repair: str | None = None
-    flags: str = "--"

@@ -138,6 +138,11 @@ class Builder:
         self.nodes.append(node)
         return node.name
 
+    def originate(self, node: str, origin: SourceName) -> None:
+        """Say what the source calls a node's tensor."""
+        at = next(i for i, n in enumerate(self.nodes) if n.name == node)
+        self.nodes[at] = replace(self.nodes[at], origin=origin)
+
     def rename(self, node: str, name: str, origin: SourceName) -> str:
         """Call a node of one output, which no other reads, by a name that is its own; returns it."""
         at = self.position.pop(node)

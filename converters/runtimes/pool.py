@@ -17,7 +17,7 @@ _ORIGINALS = tuple(r.name for r in RUNTIMES if r.originals)
 #: Runtimes that ``auto`` leaves out: a browser is started only when it is asked for, and js shows little beside others.
 _ON_REQUEST = frozenset(r.name for r in RUNTIMES if r.taken_by != "auto")
 #: Runtimes that no word takes.
-_BY_NAME = frozenset(r.name for r in RUNTIMES if r.taken_by == "name")
+BY_NAME = frozenset(r.name for r in RUNTIMES if r.taken_by == "name")
 _IN_BROWSERS = frozenset(r.name for r in RUNTIMES if r.browser)
 _KNOWN = {r.name: r for r in RUNTIMES}
 _COMMANDS: Mapping[str, Callable[[], list[str]]] = {r.name: r.command for r in RUNTIMES}
@@ -43,7 +43,7 @@ def chosen_runtimes(
     several = {
         "auto": automatic,
         "browser": [n for n in known if n in _IN_BROWSERS],
-        "full": [n for n in known if known[n].supported and n in useful and n not in _BY_NAME],
+        "full": [n for n in known if known[n].supported and n in useful and n not in BY_NAME],
         "js": ["node"],  # what --to calls the module that it runs
     }
     words = [word for word in wanted.split(",") if word] if isinstance(wanted, str) else wanted

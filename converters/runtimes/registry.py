@@ -24,6 +24,7 @@ ROOMS = (
     "csharp",
     "node",
     "openvino",
+    "torch",
 )
 RUNTIMES: tuple[Runtime, ...] = tuple(
     runtime

@@ -17,10 +17,10 @@ from msgspec.structs import replace
 from export_model.converters.graph.nn.activations import Activation
 from export_model.converters.graph.nodes import Graph
 from export_model.converters.policy.facts import SourceFacts
-from export_model.converters.trainers.pytorch.activations import activation_of
+from export_model.converters.trainers.pytorch.activations import activation_of, name_of
 from export_model.converters.trainers.pytorch.network import Network
 from export_model.converters.trainers.pytorch.weights import TensorFile, Weights, pytorch_alone
-from export_model.converters.trainers.trainer import Rebuilt, Saved, Trainer
+from export_model.converters.trainers.trainer import Modules, Rebuilt, Saved, Trainer
 from export_model.signatures.roles import Role
 
 _USUAL = "rsl_rl's default is elu"
@@ -58,8 +58,8 @@ def _layout_of(value: Any) -> _Layout | None:
     return None
 
 
-def _to_graph(archive: TensorFile, layout: _Layout, activation: Activation) -> tuple[Graph, SourceFacts]:
-    """The policy and what is known of it. Raises SourceError for parts that are not known, DamagedFileError."""
+def _to_graph(archive: TensorFile, layout: _Layout, activation: Activation) -> tuple[Graph, SourceFacts, Weights]:
+    """The policy, its facts and its weights. Raises SourceError for parts that are not known, DamagedFileError."""
     state: Mapping[Any, Any] = archive.value[layout.key]
     beside = archive.value.get("obs_norm_state_dict")
     if isinstance(beside, dict):  # up to 2.3
@@ -90,7 +90,7 @@ def _to_graph(archive: TensorFile, layout: _Layout, activation: Activation) -> t
             "offsets, clips) is not in the file",
         ),
     )
-    return net.graph(), facts
+    return net.graph(), facts, weights
 
 
 def _deviation(net: Network, mean: str, layout: _Layout) -> dict[str, Role]:
@@ -116,8 +116,14 @@ def per_action(net: Network, mean: str, values: np.ndarray, name: str) -> None:
 
 def _rebuild(saved: Saved, layout: _Layout) -> Rebuilt:
     activation, files, notes = activation_of(saved.given, saved.activation, _USUAL)
-    graph, facts = _to_graph(saved.archive, layout, activation)
-    return Rebuilt(graph, replace(facts, notes=(*facts.notes, *notes)), files)
+    graph, facts, weights = _to_graph(saved.archive, layout, activation)
+    told = {
+        "activation": name_of(activation),
+        "normalisers": [layout.normaliser, _NORMALISER],
+        **{n: getattr(layout, n) for n in ("actor", "memory", "deviation", "log_deviation")},
+    }
+    modules = Modules("rsl_rl", weights, told)
+    return Rebuilt(graph, replace(facts, notes=(*facts.notes, *notes)), files, modules)
 
 
 TRAINER = Trainer("rsl_rl", lambda saved: _layout_of(saved.value), _rebuild)

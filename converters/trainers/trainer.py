@@ -9,12 +9,13 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from msgspec import Struct
+import numpy as np
+from msgspec import Struct, field
 
 from export_model.converters.files.fetch import Fetched
 from export_model.converters.graph.nodes import Graph
 from export_model.converters.policy.facts import SourceFacts
-from export_model.converters.trainers.pytorch.weights import TensorFile
+from export_model.converters.trainers.pytorch.weights import TensorFile, Weights
 from export_model.signatures.errors import SourceError, UsageError
 
 
@@ -65,12 +66,33 @@ class Saved(Struct, frozen=True):
         return channels, height, width
 
 
+class Modules(Struct, frozen=True):
+    """The network as PyTorch builds it (converters/runtimes/torch): of which trainer, of which weights, what is told.
+
+    ``arrays`` are numbers that do not stand in the state: statistics of a file beside it.
+    """
+
+    kind: str
+    weights: Weights
+    told: Mapping[str, Any]
+    arrays: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    def write(self, folder: Path) -> Path:
+        """Write the state as plain arrays; return the file. Raises DamagedFileError, OSError."""
+        np.savez(file := folder / "state.npz", **{**self.weights.arrays(), **self.arrays})  # type: ignore[arg-type]
+        return file
+
+
 class Rebuilt(Struct, frozen=True):
-    """A policy, what is known of it, and the files beside the checkpoint that said something."""
+    """A policy, what is known of it, and the files beside the checkpoint that said something.
+
+    ``modules``: its network for PyTorch, where that is one that is built there.
+    """
 
     graph: Graph
     facts: SourceFacts
     files: tuple[Path, ...] = ()
+    modules: Modules | None = None
 
 
 class Trainer(Struct, frozen=True):

@@ -53,7 +53,7 @@ READING = (
     Row("repair", "--repair", "Mend an exporter's fault: gru-reset, log-sigmoid.", "NAME"),
     Row("normaliser", "--normaliser", "Statistics of a .zip: vecnormalize.pkl, if not next to it.", "FILE", FILE),
     Row("interface", "--interface", "YAML that states the interface (default: beside), or none.", "FILE", FILE),
-    Row("trust_source", "--trust-source", "Let Keras load what is not plain data; can run code.", both=True),
+    Row("trust_source", "--trust-source", "Let Keras or PyTorch load a file whole: its code can run.", both=True),
 )
 #: What stands before an option that is for the candidates of a comparison, not for the reference.
 CANDIDATE = "candidate_"

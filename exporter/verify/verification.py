@@ -8,7 +8,7 @@ from contextlib import closing
 from msgspec.structs import replace
 
 from export_model.converters.files.children.process import LoadedModel, RunFailedError
-from export_model.converters.runtimes.pool import INDEPENDENT
+from export_model.converters.runtimes.pool import BY_NAME, INDEPENDENT
 from export_model.exporter.verify.asked import Inputs
 from export_model.exporter.verify.checks.agents import agents
 from export_model.exporter.verify.checks.baked import check_baked
@@ -161,10 +161,16 @@ def _report(
         comparisons=tuple(findings),
         sizes=tested.sizes,
         notes=(*tested.signature.notes, *notes),
-        self_consistent=tested.source is None and not tested.runs_elsewhere,
+        self_consistent=not _may_run(tested, session.runtimes) and not tested.runs_elsewhere,
         original=reference.removeprefix("source/") if reference.startswith("source/") else None,
     )
     return _with_required(report, options.require)
+
+
+def _may_run(tested: PolicyUnderTest, runtimes: Collection[str]) -> bool:
+    """Whether a runtime that is asked for, or that a word takes, runs the source by itself."""
+    runtime = None if tested.source is None else tested.source.runtime
+    return runtime is not None and (runtime in runtimes or runtime not in BY_NAME)
 
 
 def _with_required(report: ParityReport, wanted: Collection[str]) -> ParityReport:

@@ -72,7 +72,7 @@ def test_words_stand_for_several_and_may_be_combined(monkeypatch: pytest.MonkeyP
     assert set(names("browser")) == {"numpy", *browser}
     assert set(names("onnxruntime,browser")) == {"numpy", "onnxruntime", *browser}
     assert set(names("auto,browser")) == {*names("auto"), *browser}
-    assert {"c", "csharp", "node", "litert", "litert-web", "openvino"}.isdisjoint(
+    assert {"c", "csharp", "node", "litert", "litert-web", "openvino", "torch"}.isdisjoint(
         names("full")
     )  # they run none of these, or are asked by name alone
     assert {"c", "litert"} <= set(names("full", "c", "litert"))

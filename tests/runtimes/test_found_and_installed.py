@@ -358,10 +358,10 @@ def by_name() -> dict[str, RuntimeInfo]:
 def test_the_list_has_every_runtime_in_order() -> None:
     names = "numpy tensorflow tensorflow-python tf1.4 tf1.7 onnxruntime onnxruntime-web tfjs-cpu tfjs-wasm tfjs-webgl"
     assert [info.name for info in available_runtimes()][:10] == names.split()
-    *browsers, web, litert, plain, c, csharp, node, openvino = available_runtimes()[10:]
+    *browsers, web, litert, plain, c, csharp, node, openvino, torch = available_runtimes()[10:]
     assert all(info.name.endswith("@chromium") for info in browsers)
-    own_ones = ["litert-web", "litert", "litert-plain", "c", "csharp", "node", "openvino"]
-    assert [i.name for i in (web, litert, plain, c, csharp, node, openvino)] == own_ones
+    own_ones = ["litert-web", "litert", "litert-plain", "c", "csharp", "node", "openvino", "torch"]
+    assert [i.name for i in (web, litert, plain, c, csharp, node, openvino, torch)] == own_ones
 
 
 def test_numpy_is_always_there() -> None:

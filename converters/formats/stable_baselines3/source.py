@@ -17,7 +17,7 @@ from export_model.converters.files.fetch import Fetched, path_text
 from export_model.converters.files.file_probe import json_in
 from export_model.converters.files.torch_archive import Archive
 from export_model.converters.files.zip_archives import ZIP_ERRORS, entry_of, open_archive
-from export_model.converters.formats.source import NO_NORMALISER, ReadOptions, SourceModel
+from export_model.converters.formats.source import NO_NORMALISER, ReadOptions, SourceModel, run_of
 from export_model.converters.formats.stable_baselines3.run_folder import settings_that_normalise, statistics_beside
 from export_model.converters.trainers.pytorch.weights import ArraysByName
 from export_model.converters.trainers.registry import rebuild
@@ -54,7 +54,8 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
     archive = ArraysByName({}) if policy is None else Archive(policy)
     made = rebuild(Saved(given, archive, content, activation=options.activation, statistics=beside))
     facts = replace(made.facts, notes=(*made.facts.notes, *notes))
-    return [SourceModel(made.graph, (*files, *([] if statistics is None else [statistics])), facts)]
+    read_files = (*files, *([] if statistics is None else [statistics]))
+    return [SourceModel(made.graph, read_files, facts, original=run_of(given.path, made.modules))]
 
 
 def _statistics(given: Fetched, wanted: str | None) -> tuple[Path | None, tuple[str, ...]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from export_model.converters.files.fetch import Fetched
 from export_model.converters.files.torch_archive import Archive
-from export_model.converters.formats.source import ReadOptions, SourceModel
+from export_model.converters.formats.source import ReadOptions, SourceModel, run_of
 from export_model.converters.trainers.registry import rebuild
 from export_model.converters.trainers.trainer import Saved
 
@@ -19,4 +19,4 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
         given, Archive(given.data), None, options.sensors, options.goals, options.activation, script=options.script
     )
     made = rebuild(saved)
-    return [SourceModel(made.graph, (given.path, *made.files), made.facts)]
+    return [SourceModel(made.graph, (given.path, *made.files), made.facts, original=run_of(given.path, made.modules))]

@@ -20,7 +20,7 @@ from export_model.converters.files.pickled_objects import Instance
 from export_model.converters.files.torch_archive import Storage
 from export_model.converters.files.torchscript_archive import ScriptArchive
 from export_model.converters.files.unpickle import PickledTensor as Stored
-from export_model.converters.formats.source import ReadOptions, SourceModel
+from export_model.converters.formats.source import OriginalRun, ReadOptions, SourceModel
 from export_model.converters.formats.torchscript.code import ArchiveCode
 from export_model.converters.formats.torchscript.interpreter import Interpreter
 from export_model.converters.formats.torchscript.machine import MEMORY_IN, MEMORY_OUT, Machine
@@ -89,7 +89,9 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
         found_states = {x.name: _lengths_of(x.shape) for x in _states(machine, inputs, outputs) if x.name not in memory}
         written = machine.written_buffers()
         if not found_states and written.keys() <= memory.keys():
-            return [_model(given, machine, outputs, memory, inputs)]
+            model = _model(given, machine, outputs, memory, inputs)
+            run = _original(given, machine, memory, inputs) if options.trust_source else None
+            return [replace(model, original=run)]
         memory |= {**found_states, **written}
     raise SourceError(
         "its inputs and memory do not come to rest", why="each walk through its code finds more", fix="give --sensors"
@@ -202,13 +204,26 @@ def _model(
         memory_layout=tuple(parts) if all(parts) else (),
         outputs={**roles, **({MEMORY_OUT: Role.MEMORY_OUT} if memory else {})},
         notes=(
-            "no runtime but PyTorch runs it: the verdict on the export is that its formats are self-consistent",
+            "no runtime but PyTorch runs it: unless --trust-source --verify torch does, the verdict on it is that "
+            "its formats are self-consistent",
             *([DOUBLES_NARROWED] if machine.narrowed else []),
             *([_memory_note(machine, inside)] if inside else []),
             *([f"its states {', '.join(states)} are one row for each agent: {MEMORY_IN}"] if states else []),
         ),
     )
     return SourceModel(machine.b.graph(), (given.path,), facts)
+
+
+def _original(given: Fetched, machine: Machine, memory: Memory, inputs: Sequence[_Input]) -> OriginalRun:
+    """How PyTorch runs the file, whose code it then runs."""
+    states = [x.name for x in inputs if x.name in memory]
+    told = {
+        "kind": "script",
+        "inputs": [(x.name, x.shape) for x in inputs],
+        "buffers": [(machine.name_of(key), shape) for key, shape in memory.items() if key not in states],
+        "states": states,
+    }
+    return OriginalRun("torch", given.path, told)
 
 
 def _part_of(name: str) -> str:

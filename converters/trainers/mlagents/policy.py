@@ -43,7 +43,7 @@ from export_model.converters.trainers.mlagents.state import State
 from export_model.converters.trainers.pytorch.activations import LEAKY_SLOPE
 from export_model.converters.trainers.pytorch.network import Network
 from export_model.converters.trainers.pytorch.weights import pytorch_alone
-from export_model.converters.trainers.trainer import Rebuilt
+from export_model.converters.trainers.trainer import Modules, Rebuilt
 from export_model.signatures.roles import (
     ACTION_SHAPE,
     CONTINUOUS_SHAPE,
@@ -156,7 +156,20 @@ def rebuild(state: State, given: Fetched, told: Sequence[tuple[int, ...]], goals
         notes=tuple(_notes(generation, sensors, joined, bound)),
         decisions=_reasons(generation, sensors),
     )
-    return Rebuilt(net.graph(), facts, bound.files)
+    plain = generation.by_sensor and not told and goal is None and all(len(s.shape) == 1 for s in sensors)
+    modules = _modules(state, generation, sensors, squashed=bound.squashed) if plain else None
+    return Rebuilt(net.graph(), facts, bound.files, modules)
+
+
+def _modules(state: State, generation: _Generation, sensors: Sequence[SensorInput], *, squashed: bool) -> Modules:
+    """What PyTorch builds of a policy that observes rows of numbers alone."""
+    told = {
+        "sensors": [s.module for s in sensors],
+        "body": f"{generation.body}.{'seq_layers' if state.indices(f'{generation.body}.seq_layers.') else 'layers'}",
+        "branches": len(state.indices(f"{generation.discrete}.branches.")),
+        "squashed": squashed,
+    }
+    return Modules("mlagents", state, told)
 
 
 def _notes(generation: _Generation, sensors: Sequence[SensorInput], joined: bool, bound: Bound) -> list[str]:

@@ -47,6 +47,11 @@ def activation_named(name: str) -> Activation | None:
     return _KNOWN.get(name.lower().replace("_", "").replace("-", ""))
 
 
+def name_of(activation: Activation) -> str:
+    """Return the first name of one of the table."""
+    return next(name for name, known in _KNOWN.items() if known is activation)
+
+
 def activation_from_user(name: str) -> Activation:
     """The one that the user names. Raises UsageError."""
     found = activation_named(name)

@@ -215,7 +215,8 @@ class Network(Builder):
         self.output("action", self.reshape(best, (-1, 1)))
 
     def choice(self, logits: str) -> str:
-        """A class of each row, drawn by its logits: int64 [B, 1]."""
+        """A class of each row, drawn by its logits (``logits_0``, of the next ``logits_1`` …): int64 [B, 1]."""
+        self.originate(logits, f"logits_{sum(n.op == 'Multinomial' for n in self.nodes)}")
         return self.add("Multinomial", [logits, self.ints(1, "count")], output_dtype=INT64)
 
     def choices(self, logits: str, sizes: Sequence[int]) -> str:

@@ -47,6 +47,7 @@ class Weights:
             k: v for k, v in tensors.items() if isinstance(k, str) and isinstance(v, PickledTensor)
         }
         self._left = {str(name) for name in tensors}
+        self._read: dict[str, np.ndarray] = {}
 
     def __contains__(self, name: str) -> bool:
         return name in self._tensors
@@ -79,7 +80,12 @@ class Weights:
         if array.dtype.kind not in "fiu":
             raise self.damaged_error(f"{name} holds no numbers", f"its dtype is {array.dtype}")
         self._left.discard(name)
+        self._read[name] = array
         return array.astype(np.float32)
+
+    def arrays(self) -> Mapping[str, np.ndarray]:
+        """Return the tensors that were read, as the file has them."""
+        return self._read
 
     def number(self, name: str) -> float:
         """A tensor of one element."""
@@ -118,6 +124,6 @@ class Weights:
 def pytorch_alone(maker: str, what: str = "it") -> str:
     """The note on a file that nothing runs which a verification could ask."""
     return (
-        f"no runtime but PyTorch with {maker} reads {what}: the verdict on the export is that its formats are "
-        "self-consistent"
+        f"no runtime but PyTorch with {maker} reads {what}: unless --verify torch builds its network, the verdict on "
+        "the export is that its formats are self-consistent"
     )

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from export_model.converters.policy.facts import SourceFacts
-from export_model.converters.trainers.pytorch.activations import activation_of
+from export_model.converters.trainers.pytorch.activations import activation_of, name_of
 from export_model.converters.trainers.pytorch.network import Network
 from export_model.converters.trainers.pytorch.weights import Weights, pytorch_alone
 from export_model.converters.trainers.scripts.building import Making
 from export_model.converters.trainers.scripts.choice import EXPORT_ONNX, Known, choose_script, known_state
-from export_model.converters.trainers.trainer import Rebuilt, Saved, Trainer
+from export_model.converters.trainers.trainer import Modules, Rebuilt, Saved, Trainer
 
 _USUAL = "CleanRL's scripts have tanh in PPO, relu elsewhere and before images"
 
@@ -35,7 +35,10 @@ def _rebuild(saved: Saved, known: Known) -> Rebuilt:
             *notes,
         ),
     )
-    return Rebuilt(making.net.graph(), facts, files)
+    plain = all(array.ndim < 3 for name, array in weights.arrays().items() if name.endswith("weight"))
+    told = {"build": script.build.__name__, "activation": name_of(activation)}
+    modules = Modules("scripts", weights, told) if plain else None
+    return Rebuilt(making.net.graph(), facts, files, modules)
 
 
 TRAINER = Trainer("CleanRL and PPO-PyTorch", lambda saved: known_state(saved.value), _rebuild, scripts=True)

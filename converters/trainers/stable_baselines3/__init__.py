@@ -21,7 +21,8 @@ def _rebuild(saved: Saved, data: Mapping[str, Any]) -> Rebuilt:
             fix="save the model again: model.save",
         )
     normaliser = None if saved.statistics is None else read_normaliser(*saved.statistics)
-    return Rebuilt(*to_graph(data, archive, archive.value, saved.activation, normaliser))
+    graph, facts, modules = to_graph(data, archive, archive.value, saved.activation, normaliser)
+    return Rebuilt(graph, facts, modules=modules)
 
 
 TRAINER = Trainer("Stable-Baselines3", lambda saved: saved.settings, _rebuild, by_names=False)

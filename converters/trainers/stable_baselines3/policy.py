@@ -18,12 +18,13 @@ from export_model.converters.graph.nn.activations import Activation, clip
 from export_model.converters.graph.nodes import Graph
 from export_model.converters.graph.types import FLOAT32, INT64
 from export_model.converters.policy.facts import SourceFacts
-from export_model.converters.trainers.pytorch.activations import activation_from_user, activation_named
+from export_model.converters.trainers.pytorch.activations import activation_from_user, activation_named, name_of
 from export_model.converters.trainers.pytorch.network import Network
 from export_model.converters.trainers.pytorch.weights import TensorFile, Weights, pytorch_alone
 from export_model.converters.trainers.stable_baselines3.layers import renormalised_mlp
 from export_model.converters.trainers.stable_baselines3.normaliser import Normaliser
 from export_model.converters.trainers.stable_baselines3.spaces import Space, space_of
+from export_model.converters.trainers.trainer import Modules
 from export_model.signatures.errors import DamagedFileError, SourceError, UsageError
 from export_model.signatures.roles import Role
 
@@ -69,9 +70,10 @@ def to_graph(
     state: Mapping[Any, Any],
     activation: str | None,
     normaliser: Normaliser | None,
-) -> tuple[Graph, SourceFacts]:
-    """The policy and what is known of it; ``activation`` is what the user names, ``normaliser`` what lies beside it.
+) -> tuple[Graph, SourceFacts, Modules | None]:
+    """The policy, what is known of it, and its modules where these are plain.
 
+    ``activation`` is what the user names, ``normaliser`` what lies beside it.
     Raises SourceError for what is not built, DamagedFileError, UsageError.
     """
     family = _family(data)
@@ -109,7 +111,35 @@ def to_graph(
         outputs=made.outputs,
         notes=(pytorch_alone("Stable-Baselines3"), *(normaliser.notes() if normaliser else ()), *made.notes),
     )
-    return made.net.graph(), facts
+    return made.net.graph(), facts, _modules(made, family, observed)
+
+
+def _modules(made: _Built, family: _Family, observed: Observed) -> Modules | None:
+    """What PyTorch builds: of policies that see one row of numbers, and do without gSDE, masks and bits."""
+    name, known = family.build.__name__.strip("_"), made.net.state.arrays()
+    plain = isinstance(observed, Space) and len(observed.shape) == 1 and not observed.counts
+    gsde = known.get("log_std", np.zeros(1)).ndim > 1 or (
+        name == "gaussian_actor" and "actor.log_std.weight" not in known
+    )
+    renormalised = any(n.endswith("ra_mean") for n in known)
+    own = gsde or renormalised or made.maskable or name == "ars_policy" or made.actions.kind == "MultiBinary"
+    if not plain or own:
+        return None
+    low, high = made.actions.bounds() if made.actions.kind == "Box" else ((), ())
+    told = {
+        "family": name,
+        "activation": name_of(made.activation),
+        "squashed": made.squashed,
+        "low": [float(n) for n in low],
+        "high": [float(n) for n in high],
+        "branches": list(made.actions.counts),
+        "actions": made.actions.size,
+    }
+    normaliser = made.normaliser if made.normaliser is not None and made.normaliser.applied else None
+    moments = next(iter(normaliser.applied.values())) if normaliser else None
+    arrays = {"obs_rms.mean": moments.mean, "obs_rms.deviation": moments.deviation} if moments else {}
+    told["limit"] = normaliser.limit if normaliser else None
+    return Modules("stable_baselines3", made.net.state, told, arrays)
 
 
 # ------------------------------------------------------------------ what data says
@@ -401,7 +431,7 @@ def _categorical(made: _Built, logits: str) -> None:
     parts, start = [], 0
     for size in sizes:
         step = columns or size
-        branch = net.slice(masked, 1, start, start + step)
+        branch = net.slice(masked, 1, start, start + step) if len(sizes) > 1 else masked
         if columns:
             branch = net.concat([net.add("ZerosLike", [branch]), branch], 1)
         parts.append(net.choice(branch))
