@@ -15,8 +15,9 @@ from export_model.exporter.cli.console import Console
 from export_model.exporter.cli.options import RULES, as_given
 from export_model.exporter.cli.terminal import say_lines
 from export_model.exporter.fleet.fleet import export_fleet
+from export_model.exporter.fleet.outcome import Outcome
 from export_model.exporter.fleet.sources import PassedOver, paths_text, sources_in
-from export_model.exporter.fleet.worker import Outcome, Wanted
+from export_model.exporter.fleet.worker import Wanted
 from export_model.exporter.tables import count_text
 from export_model.signatures.errors import ExportModelError, UsageError
 

@@ -60,12 +60,13 @@ class Claim(Struct, frozen=True):
 class Turns(Struct, Generic[Who]):
     """Who waits for names: each until all sources before its own have theirs, or have ended without.
 
-    So names do not depend on who is quick.
+    So names do not depend on who is quick. Who asks again for a source that has its names gets the same.
     """
 
     names: Names
     _asking: dict[int, tuple[Who, Claim]] = field(default_factory=dict)
     _ended: set[int] = field(default_factory=set)
+    _given: dict[int, list[Claimed]] = field(default_factory=dict)
     _first: int = 0
 
     def asks(self, number: int, who: Who, claim: Claim) -> None:
@@ -80,6 +81,8 @@ class Turns(Struct, Generic[Who]):
 
     def answers(self) -> Iterator[tuple[int, Who, list[Claimed]]]:
         """Those whose turn it is: the source's number, who asked, and the names."""
+        for number in [n for n in self._asking if n in self._given]:
+            yield number, self._asking.pop(number)[0], self._given[number]
         while True:
             number = self._first
             if number in self._ended:
@@ -89,7 +92,8 @@ class Turns(Struct, Generic[Who]):
             self._first += 1
             if number in self._asking:
                 who, claim = self._asking.pop(number)
-                yield number, who, self.names.claim(claim.path, claim.names)
+                self._given[number] = self.names.claim(claim.path, claim.names)
+                yield number, who, self._given[number]
 
 
 def _wishes(path: Path, name: str) -> Iterator[str]:

@@ -147,6 +147,8 @@ class Exporter:
             self.runtimes, self._known = chosen_runtimes(options.verify, self._formats)
         _check_parity(options, self._formats)
         check_sendable(options.out)
+        #: takes bundles that are staged and puts them in their places later (fleet/batch.py): stage, folder, place
+        self.hold: Callable[[contextlib.ExitStack, Path, Path], None] | None = None
         self._labels = read_labels(options.labels)
         self._labelled_by = printable(Path(options.labels).name) if isinstance(options.labels, Path | str) else "labels"
 
@@ -230,10 +232,11 @@ class Exporter:
         options, policy = self.options, job.policy
         whole_sizes = sizes_unrounded(job, [a.format for a in artifacts], options)
         with (
-            landing(options.out) as (out, put),
-            bundle.stage_bundle(out / policy.name, contract, artifacts) as stage,
+            contextlib.ExitStack() as staging,
             scratch_folder() if self.runtimes else nullcontext(Path()) as folder,
         ):
+            out, put = staging.enter_context(landing(options.out))
+            stage = staging.enter_context(bundle.stage_bundle(out / policy.name, contract, artifacts))
             report = None
             if self.runtimes:
                 from export_model.exporter.verify.session import Session
@@ -259,7 +262,12 @@ class Exporter:
                 with bundle.writing(out):
                     (stage / PARITY).write_bytes(bundle.dumps(report.to_dict()))
             failed = report is not None and report.passed is False
-            place = put(stage, f"{policy.name}{bundle.FAILED}" if failed else policy.name)
+            name = f"{policy.name}{bundle.FAILED}" if failed else policy.name
+            if self.hold is None or out != options.out:
+                place = put(stage, name)
+            else:
+                place = out / name
+                self.hold(staging.pop_all(), stage, place)
         return ExportResult(
             policy=policy,
             folder=place,

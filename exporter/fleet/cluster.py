@@ -30,7 +30,8 @@ from export_model.exporter.export.labels import read_labels
 from export_model.exporter.export.names import Claim, Claimed, Turns
 from export_model.exporter.export.options import ExportOptions
 from export_model.exporter.export.pipeline import Exporter
-from export_model.exporter.fleet.worker import Outcome, Wanted, export_source
+from export_model.exporter.fleet.outcome import Outcome
+from export_model.exporter.fleet.worker import Wanted, export_source
 from export_model.signatures.errors import RuntimeUnavailableError, SourceError, UsageError
 
 #: Seconds in which a scheduler answers.

@@ -9,6 +9,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from multiprocessing.connection import Connection, wait
@@ -18,14 +19,17 @@ from pathlib import Path
 from typing import Any
 
 from msgspec import Struct, field
+from msgspec.structs import replace
 
 from export_model.converters.files.fetch import path_text
 from export_model.converters.runtimes.pool import RuntimePool
 from export_model.exporter.export.names import Claim, Names, Turns
 from export_model.exporter.export.options import ExportOptions
 from export_model.exporter.export.pipeline import Exporter
+from export_model.exporter.fleet.batch import Batch
 from export_model.exporter.fleet.ledger import Ledger
-from export_model.exporter.fleet.worker import Outcome, Wanted, export_source, work
+from export_model.exporter.fleet.outcome import Outcome
+from export_model.exporter.fleet.worker import Wanted, export_source, work
 from export_model.signatures.errors import SourceError, UsageError
 
 #: How long a worker may take to clean up when it is told to end.
@@ -53,7 +57,7 @@ def export_fleet(
         raise UsageError(f"--jobs {jobs}: must be 1 or more", fix="leave it out: one at a time")
     if options.name is not None and len(paths) > 1:
         raise UsageError("--name goes with a single policy", fix="export one source, or leave --name out")
-    wanted = wanted or Wanted()
+    wanted = replace(wanted or Wanted(), at_once=fail_fast)
     exporter, names = Exporter(options), Names()
     exporter.check(paths, lambda text: None)
     ledger = Ledger(options, exporter.runtimes)
@@ -83,9 +87,11 @@ def export_fleet(
 
 
 def _here(exporter: Exporter, paths: Sequence[Path], names: Names, wanted: Wanted) -> Iterator[Outcome]:
-    with RuntimePool() as pool:
+    with RuntimePool() as pool, Batch(wanted.at_once) as batch:
+        exporter.hold = batch.hold
         for path in paths:
-            yield export_source(exporter, path, names, pool, wanted)
+            yield from batch.add(export_source(exporter, path, names, pool, wanted))
+        yield from batch.settle()
 
 
 @contextmanager
@@ -122,8 +128,10 @@ def _interrupts_wait() -> Iterator[None]:
 class _Worker(Struct):
     process: BaseProcess
     pipe: Connection
-    #: which source it is at
-    at: int
+    #: which source it is at; None where it has been told to end
+    at: int | None
+    #: the sources that it is done with, but for their bundles' way to their places
+    staged: list[int] = field(default_factory=list)
 
 
 class _Crew(Struct):
@@ -131,78 +139,99 @@ class _Crew(Struct):
     wanted: Wanted
     turns: Turns[_Worker]
     paths: Sequence[Path]
+    todo: deque[int] = field(default_factory=deque)
     workers: list[_Worker] = field(default_factory=list)
     #: workers that have nothing left to do, and end
     ending: list[_Worker] = field(default_factory=list)
+    #: sources that were lost with a process that died at another
+    lost: set[int] = field(default_factory=set)
 
     def run(self, count: int) -> Iterator[Outcome]:
         """What becomes of the sources, as it comes."""
-        todo = iter(range(len(self.paths)))
+        self.todo.extend(range(len(self.paths)))
         with self:
             for _ in range(count):
-                self._start(next(todo))
+                self._start()
             while self.workers:
                 for ready in wait([w.pipe for w in self.workers]):
                     worker = next(w for w in self.workers if w.pipe is ready)
-                    outcome = self._receive(worker)
-                    if outcome is None:
+                    outcomes = self._receive(worker)
+                    if outcomes is None:
                         continue
-                    self.turns.ends(worker.at)
-                    self._give_names()
-                    self._next(worker, next(todo, None))
-                    yield outcome
+                    if worker.at is not None:
+                        self.turns.ends(worker.at)
+                        self._give_names()
+                    self._next(worker)
+                    yield from outcomes
 
-    def _receive(self, worker: _Worker) -> Outcome | None:
-        """What a worker says: the end of a source, or None where it asked for names."""
-        path = self.paths[worker.at]
+    def _receive(self, worker: _Worker) -> list[Outcome] | None:
+        """What a worker says: the outcomes that are certain, or None where it asked for names."""
         try:
             message: Any = worker.pipe.recv()
         except (EOFError, OSError):
             worker.process.join()
-            return Outcome(
-                path,
+            return self._after_death(worker)
+        if isinstance(message, Claim):
+            assert worker.at is not None
+            self.turns.asks(worker.at, worker, message)
+            self._give_names()
+            return None
+        if worker.at is not None:
+            worker.staged.append(worker.at)
+        for outcome in message:
+            worker.staged.remove(next(n for n in worker.staged if self.paths[n] == outcome.path))
+        return list(message)
+
+    def _after_death(self, worker: _Worker) -> list[Outcome]:
+        """The outcomes of sources whose process died at them; what was only staged is exported again, once."""
+        died = [n for n in worker.staged if n in self.lost] + ([] if worker.at is None else [worker.at])
+        again = [n for n in worker.staged if n not in self.lost]
+        self.lost.update(again)
+        self.todo.extendleft(reversed(again))
+        return [
+            Outcome(
+                self.paths[number],
                 error=SourceError(
                     "the process that exported it ended",
-                    where=path_text(path),
+                    where=path_text(self.paths[number]),
                     why=f"its status is {worker.process.exitcode}",
                     fix="export it alone to see more; if memory ran out, use fewer --jobs",
                 ),
             )
-        if isinstance(message, Claim):
-            self.turns.asks(worker.at, worker, message)
-            self._give_names()
-            return None
-        assert isinstance(message, Outcome)
-        return message
+            for number in died
+        ]
 
     def _give_names(self) -> None:
         for _, worker, names in self.turns.answers():
             self._send(worker, names)
 
-    def _next(self, worker: _Worker, index: int | None) -> None:
+    def _next(self, worker: _Worker) -> None:
         if not worker.process.is_alive():
             worker.pipe.close()
             self.workers.remove(worker)
-            if index is not None:
-                self._start(index)
-        elif index is None:
+            if self.todo:
+                self._start()
+        elif self.todo:
+            worker.at = self.todo.popleft()
+            self._send(worker, self.paths[worker.at])
+        elif worker.at is not None:  # what it has staged comes last
+            worker.at = None
             self._send(worker, None)
+        else:
             self.workers.remove(worker)
             self.ending.append(worker)
-        else:
-            worker.at = index
-            self._send(worker, self.paths[index])
 
-    def _start(self, index: int) -> None:
+    def _start(self) -> None:
         context = multiprocessing.get_context("spawn")
         ours, theirs = context.Pipe()
         process = context.Process(target=work, args=(theirs, self.options, self.wanted), daemon=False)
         with _no_modules_of_this_folder(), _interrupts_wait():
             process.start()
         theirs.close()
-        worker = _Worker(process, ours, index)
+        number = self.todo.popleft()
+        worker = _Worker(process, ours, number)
         self.workers.append(worker)
-        self._send(worker, self.paths[index])
+        self._send(worker, self.paths[number])
 
     @staticmethod
     def _send(worker: _Worker, message: Any) -> None:

@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from multiprocessing.connection import Connection
 from pathlib import Path
 from types import FrameType
-from typing import Any
 
 from msgspec import Struct
 
@@ -18,45 +17,12 @@ from export_model.converters.runtimes.pool import RuntimePool
 from export_model.exporter.export.names import Claim, Claimed, Naming
 from export_model.exporter.export.options import ExportOptions
 from export_model.exporter.export.pipeline import Exporter, ExportResult, near
+from export_model.exporter.fleet.batch import Batch
 from export_model.exporter.fleet.ledger import Stamp, State, stamps, state
-from export_model.exporter.reports.entry import Entry, of_result
+from export_model.exporter.fleet.outcome import Outcome, Written, one_error
+from export_model.exporter.reports.entry import of_result
 from export_model.signatures.cycles import raise_gc_threshold
-from export_model.signatures.errors import ExportModelError, RefusedError, SourceError
-
-
-class Written(Struct, frozen=True):
-    """A policy of many, written.
-
-    ``entry`` is there where reports were asked for, ``failure`` where formats disagree; ``undecided`` says why nothing
-    was decided.
-    """
-
-    name: str
-    folder: Path
-    passed: bool | None
-    what: str
-    renamed: str | None = None
-    failure: str | None = None
-    undecided: str = ""
-    answer: Mapping[str, Any] | None = None
-    entry: Entry | None = None
-
-
-class Outcome(Struct, frozen=True):
-    """What became of a source: its policies, or why there are none (or not all of them)."""
-
-    path: Path
-    policies: tuple[Written, ...] = ()
-    error: ExportModelError | None = None
-    unchanged: bool = False
-    #: what tells whether it is unchanged; ``files`` is None where it did not stay so while it was exported
-    seen: State = None
-    files: Mapping[str, Stamp] | None = None
-
-    @property
-    def failed(self) -> bool:
-        """Whether it was refused or formats disagree."""
-        return self.error is not None or any(p.passed is False for p in self.policies)
+from export_model.signatures.errors import ExportModelError, SourceError
 
 
 class Wanted(Struct, frozen=True):
@@ -64,10 +30,12 @@ class Wanted(Struct, frozen=True):
 
     answers: bool = False
     entries: bool = False
+    #: each as soon as it is there: a failure ends the run
+    at_once: bool = False
 
 
 def export_source(exporter: Exporter, path: Path, names: Naming, pool: RuntimePool, wanted: Wanted) -> Outcome:
-    """Export one source."""
+    """Export one source; with ``exporter.hold`` its bundles are staged, and in no places yet."""
     policies: list[Written] = []
     refused: list[ExportModelError] = []
     files: Mapping[str, Stamp] | None = None
@@ -83,8 +51,7 @@ def export_source(exporter: Exporter, path: Path, names: Naming, pool: RuntimePo
     except OSError as error:
         return Outcome(path, tuple(policies), SourceError("cannot be read", where=path_text(path), why=error.strerror))
     if refused:
-        told = refused[0] if len(refused) == 1 else RefusedError(refused, len(refused) + min(len(policies), 1))
-        return Outcome(path, tuple(policies), told)
+        return Outcome(path, tuple(policies), one_error(refused, len(policies)))
     return Outcome(path, tuple(policies), seen=seen, files=files if _stays(path, seen) else None)
 
 
@@ -137,9 +104,11 @@ def work(pipe: Connection, options: ExportOptions, wanted: Wanted) -> None:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     exporter = Exporter(options)
     try:
-        with RuntimePool() as pool:
+        with RuntimePool() as pool, Batch(wanted.at_once) as batch:
+            exporter.hold = batch.hold
             while (path := pipe.recv()) is not None:
-                pipe.send(export_source(exporter, path, _Asking(pipe), pool, wanted))
+                pipe.send(batch.add(export_source(exporter, path, _Asking(pipe), pool, wanted)))
+            pipe.send(batch.settle())
     except (EOFError, BrokenPipeError):  # nobody listens any more
         sys.exit(1)
 

@@ -20,7 +20,8 @@ from export_model.exporter.export.names import Claim
 from export_model.exporter.export.pipeline import ExportOptions
 from export_model.exporter.fleet import cluster as fleet_cluster
 from export_model.exporter.fleet.fleet import export_fleet
-from export_model.exporter.fleet.worker import Outcome, Wanted
+from export_model.exporter.fleet.outcome import Outcome
+from export_model.exporter.fleet.worker import Wanted
 from export_model.signatures.errors import RuntimeUnavailableError
 from fixtures import path as fixture
 from tests.commands import PYTHONPATH, export_model

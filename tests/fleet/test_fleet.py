@@ -3,25 +3,33 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
 import signal
+import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from export_model import export
+from export_model.converters.formats.bundle import bundle, exchange
+from export_model.converters.formats.bundle.bundle import Bundle
 from export_model.exporter.cli.fleet import _Tally
+from export_model.exporter.export.names import Claim, Names, Turns
 from export_model.exporter.export.pipeline import Exporter, ExportOptions
+from export_model.exporter.fleet import batch, fleet
 from export_model.exporter.fleet.fleet import export_fleet
 from export_model.exporter.fleet.marks import mark, read_key
-from export_model.exporter.fleet.worker import Outcome
+from export_model.exporter.fleet.outcome import Outcome
+from export_model.exporter.fleet.worker import Wanted
 from export_model.signatures.errors import UsageError
 from fixtures import path as fixture
 from fixtures.trained import run_folder
-from tests.commands import export_model
+from tests.commands import export_model, python
 
 NAMES = ("continuous", "discrete", "twobrains", "visual")
 
@@ -196,15 +204,18 @@ def test_a_run_that_was_stopped_goes_on(sources: list[Path], tmp_path: Path) -> 
     assert not [p for p in (tmp_path / "out").iterdir() if p.name.startswith(".export-model")]
 
 
+@pytest.mark.parametrize("folder", ["a", "b"])
 def test_a_process_that_dies_costs_one_source(
-    sources: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    folder: str, sources: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from export_model.exporter.fleet import fleet
-
+    """Those that it had staged before, another process exports again, once, under the names that they have."""
     real = fleet._Crew._receive
+    staged: list[int] = []
 
-    def killing(crew: fleet._Crew, worker: fleet._Worker) -> Outcome | None:
-        if crew.paths[worker.at].name == "discrete.bytes" and crew.paths[worker.at].parent.name == "a":
+    def killing(crew: fleet._Crew, worker: fleet._Worker) -> list[Outcome] | None:
+        at = None if worker.at is None else crew.paths[worker.at]
+        if at == tmp_path / folder / "discrete.bytes":
+            staged.append(len(worker.staged))
             assert worker.process.pid is not None
             os.kill(worker.process.pid, signal.SIGKILL)
             worker.process.join()
@@ -217,10 +228,117 @@ def test_a_process_that_dies_costs_one_source(
 
     monkeypatch.setattr(fleet._Crew, "_receive", killing)
     made = run(sources, tmp_path / "out", jobs=2)
-    lost = made[str(tmp_path / "a" / "discrete.bytes")]
+    lost = made.pop(str(tmp_path / folder / "discrete.bytes"))
     assert lost.error is not None
     assert "its status is -9" in lost.error.message
-    assert sum(o.error is None for o in made.values()) == len(sources) - 2
+    assert [p for p, o in made.items() if o.error is not None] == [str(tmp_path / "a" / "broken.bytes")]
+    assert any(staged) or folder == "a"
+    names = sorted(p.name for o in made.values() for p in o.policies)
+    assert len(names) == len(set(names)) == 9
+    assert names == sorted(contents_of_bundles(tmp_path / "out"))
+
+
+def contents_of_bundles(out: Path) -> list[str]:
+    """The names of the bundles of a folder, each of which is whole; nothing else lies there."""
+    inside = [p for p in out.iterdir() if p.name != ".exported.jsonl"]
+    for place in inside:
+        Bundle.open(place).verify_hashes()
+    return [p.name for p in inside]
+
+
+def test_what_is_only_staged_is_exported_again_once(tmp_path: Path) -> None:
+    crew = fleet._Crew(ExportOptions(tmp_path), Wanted(), Turns(Names()), [Path("a"), Path("b"), Path("c")])
+    crew.turns.asks(0, "first", Claim(Path("a"), ["x"]))  # type: ignore[arg-type]
+    assert [n for _, _, n in crew.turns.answers()] == [[("x", None)]]
+    worker = fleet._Worker(SimpleNamespace(exitcode=-9), None, 2, [0, 1])  # type: ignore[arg-type]
+    assert [o.path for o in crew._after_death(worker)] == [Path("c")]
+    assert list(crew.todo) == [0, 1]
+    crew.turns.asks(0, "second", Claim(Path("a"), ["x"]))  # type: ignore[arg-type]
+    assert list(crew.turns.answers()) == [(0, "second", [("x", None)])]
+    worker = fleet._Worker(SimpleNamespace(exitcode=-9), None, None, [1, 0])  # type: ignore[arg-type]
+    assert [o.path for o in crew._after_death(worker)] == [Path("b"), Path("a")]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere each file is waited for")
+def test_a_batch_of_bundles_waits_for_the_disk_once(
+    sources: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two waits a batch, of its content before the first exchange and of the names after the last (60 of 200)."""
+    waits: list[str] = []
+    assert 2 * math.ceil(200 / batch._MOST_BUNDLES) <= 60
+    real = exchange.exchange
+    monkeypatch.setattr(os, "fsync", lambda number: waits.append("names"))
+    monkeypatch.setattr(exchange, "_sync_file_system", lambda folder: not waits.append("content"))
+    monkeypatch.setattr(bundle, "exchange", lambda new, place: (waits.append("exchange"), real(new, place)))
+    monkeypatch.setattr(batch, "_MOST_BUNDLES", 4)
+    made = run([s for s in sources if "twobrains" not in s.name], tmp_path / "out")
+    assert sum(len(o.policies) for o in made.values()) == 6
+    assert waits == ["content", *["exchange"] * 4, "names", "content", *["exchange"] * 2, "names"]
+
+
+_KILLED = """
+import os, signal, sys
+from pathlib import Path
+from export_model.converters.formats.bundle import bundle
+from export_model.exporter.export.options import ExportOptions
+from export_model.exporter.fleet.fleet import export_fleet
+
+out, at, *sources = sys.argv[1:]
+left = int(at)
+real = getattr(bundle, "exchange" if left else "sync_contents")
+
+def die(*given):
+    global left
+    if left <= 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+    left -= 1
+    real(*given)
+
+setattr(bundle, real.__name__, die)
+options = ExportOptions(Path(out), targets=("onnx",), verify="none")
+list(export_fleet(list(map(Path, sources)), options))
+"""
+
+
+@pytest.mark.parametrize("at", [0, 1, 4])
+def test_a_batch_that_is_killed_tears_nothing(at: int, sources: list[Path], tmp_path: Path) -> None:
+    """Before the disk was waited for, or between two exchanges; over an older bundle of each."""
+    out = tmp_path / "out"
+    sources = [s for s in sources if s.name != "broken.bytes"]
+    run(sources, out)
+    before = contents(out)
+    ran = python("-c", _KILLED, out, at, *sources)
+    assert ran.status == -signal.SIGKILL, ran
+    names = [p.name for p in out.iterdir() if not p.name.startswith(".")]
+    assert len(names) == 10
+    for name in names:
+        Bundle.open(out / name).verify_hashes()
+    old = {name for name in before if (out / name).exists() and (out / name).read_bytes() == before[name]}
+    assert len([n for n in names if f"{n}/policy.json" in old]) == 10 - max(at - 1, 0)
+    options = ExportOptions(out, targets=("onnx",), verify="none")
+    assert not any(o.unchanged or o.failed for o in export_fleet(sources, options))  # none of them was recorded
+    assert sorted(contents_of_bundles(out)) == sorted(names)
+
+
+def test_a_bundle_that_cannot_be_put_in_its_place_costs_its_source(
+    sources: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = exchange.exchange
+
+    def refuse(new: Path, place: Path) -> None:
+        if place.name == "discrete":
+            raise OSError(5, "Input/output error")
+        real(new, place)
+
+    monkeypatch.setattr(bundle, "exchange", refuse)
+    made = run(sources, tmp_path / "out")
+    refused = {o.path: o.error for o in made.values() if o.error is not None}
+    assert set(refused) == {tmp_path / "a" / "broken.bytes", tmp_path / "a" / "discrete.bytes"}
+    assert "Input/output error" in refused[tmp_path / "a" / "discrete.bytes"].message
+    assert len(contents_of_bundles(tmp_path / "out")) == 9
+    monkeypatch.setattr(exchange, "_sync_file_system", lambda folder: (_ for _ in ()).throw(OSError(28, "No space")))
+    assert all("No space" in o.error.message for o in run(sources[:2], tmp_path / "full").values() if o.error)
+    assert contents_of_bundles(tmp_path / "full") == []
 
 
 def test_the_first_failure_may_be_the_end(sources: list[Path], tmp_path: Path) -> None:

@@ -13,8 +13,8 @@ import pytest
 from export_model.converters.files import fetch
 from export_model.exporter.export.pipeline import ExportOptions
 from export_model.exporter.fleet.fleet import export_fleet
+from export_model.exporter.fleet.outcome import Outcome
 from export_model.exporter.fleet.sources import sources_in
-from export_model.exporter.fleet.worker import Outcome
 from export_model.exporter.remote import fetching, sending
 from export_model.exporter.remote.fetching import nearby
 from export_model.exporter.remote.filesystem import remote

@@ -7,7 +7,7 @@ import errno
 import json
 import shlex
 import stat
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -15,7 +15,14 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from export_model.converters.files.fetch import inside, neighbours, path_text
-from export_model.converters.formats.bundle.exchange import exchange, recover, stage, take_away
+from export_model.converters.formats.bundle.exchange import (
+    exchange,
+    recover,
+    stage,
+    sync_contents,
+    sync_names,
+    take_away,
+)
 from export_model.converters.formats.embed import contract_text, without_contract
 from export_model.converters.formats.format import Artifact, Format
 from export_model.converters.formats.frozen_graph.reader import read_graph
@@ -252,9 +259,43 @@ def stage_bundle(place: Path, contract: Contract, artifacts: Sequence[Artifact])
 
 def put_in_place(new: Path, place: Path) -> None:
     """Exchange a staged bundle with what is at ``place``; what was set aside there goes. Raises BundleError."""
-    check_replaceable(place)
+    for error in put_all_in_place([(new, place)]).values():
+        raise error
+
+
+def put_all_in_place(staged: Sequence[tuple[Path, Path]]) -> dict[Path, BundleError]:
+    """Do as ``put_in_place`` with several, which wait for the disk together; return the errors of places."""
+    errors: dict[Path, BundleError] = {}
+
+    def do(step: Callable[[Path, Path], None]) -> None:
+        for new, place in staged:
+            if place not in errors:
+                try:
+                    step(new, place)
+                except BundleError as error:
+                    errors[place] = error
+
+    do(lambda new, place: check_replaceable(place))
+    ready = [new for new, place in staged if place not in errors]
+    refused: list[OSError] = []
+    try:
+        sync_contents(ready)
+    except OSError as error:
+        refused.append(error)
+    do(lambda new, place: _exchange_one(new, place, refused))
+    sync_names([place for _, place in staged if place not in errors])
+    do(lambda new, place: _remove_failed(place))
+    return errors
+
+
+def _exchange_one(new: Path, place: Path, refused: Sequence[OSError]) -> None:
     with writing(place):
+        if refused:
+            raise refused[0]
         exchange(new, place)
+
+
+def _remove_failed(place: Path) -> None:
     failed = place.with_name(place.name + FAILED)
     if (failed / POLICY).is_file() and not failed.is_symlink():
         with writing(failed, "cannot be removed"):

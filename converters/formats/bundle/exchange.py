@@ -15,7 +15,7 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from export_model.converters.files.folders import LeftoverWarning, OwnFolder, left_in, sweep, try_lock
@@ -45,16 +45,36 @@ def stage(place: Path) -> Iterator[Path]:
 
 
 def exchange(new: Path, place: Path) -> None:
-    """Put ``new``, the folder of a ``stage``, in its place; what was there goes with the stage. Raises OSError."""
-    _sync_folder(new)
+    """Put ``new``, the folder of a ``stage``, in its place; what was there goes with the stage. Raises OSError.
+
+    Its content is on the disk (``sync_contents``).
+    """
     if not place.exists():
         new.rename(place)
     elif not _exchange(new, place):
         _two_renames(new, place)
-    try:
-        _sync(place.parent)
-    except OSError as error:  # it is in its place: that is no failure any more
-        warnings.warn(f"{place} may be lost in a power cut: {error}", LeftoverWarning, stacklevel=2)
+
+
+def sync_contents(folders: Sequence[Path]) -> None:
+    """Wait until all of the folders is on the disk: after a power cut, what has a name has its content.
+
+    Of several, all that lies on their file systems is waited for, in one call each: a call for every file of every
+    folder is a wait each. Raises OSError.
+    """
+    systems = {folder.stat().st_dev: folder for folder in folders}
+    if len(folders) < 2 or not all(_sync_file_system(folder) for folder in systems.values()):
+        for folder in folders:
+            _sync_folder(folder)
+
+
+def sync_names(places: Sequence[Path]) -> None:
+    """Wait until the names of what was exchanged are on the disk; where they are not, that is said by a warning."""
+    for parent in dict.fromkeys(place.parent for place in places):
+        try:
+            _sync(parent)
+        except OSError as error:  # all is in its place: that is no failure any more
+            lost = ", ".join(str(place) for place in places if place.parent == parent)
+            warnings.warn(f"{lost} may be lost in a power cut: {error}", LeftoverWarning, stacklevel=3)
 
 
 def take_away(place: Path) -> None:
@@ -100,18 +120,37 @@ def _two_renames(new: Path, place: Path) -> None:
 
 def _exchange(a: Path, b: Path) -> bool:
     """renameat2(RENAME_EXCHANGE): both paths change places in one step. Linux only; False where it is not to be had."""
-    platform: str = sys.platform
-    if platform != "linux":
-        return False
-    function = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+    function = _linux_call("renameat2")
     if function is None:
         return False
     result: int = function(_AT_FDCWD, os.fsencode(a), _AT_FDCWD, os.fsencode(b), _RENAME_EXCHANGE)
     return result == 0
 
 
+def _sync_file_system(folder: Path) -> bool:
+    """syncfs: all of a folder's file system is on the disk. Linux only; False where it is not to be had.
+
+    Raises OSError; that a file could not be written is said by Linux 5.8 and later.
+    """
+    function = _linux_call("syncfs")
+    if function is None:
+        return False
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        if function(descriptor) != 0:
+            number = ctypes.get_errno()
+            raise OSError(number, os.strerror(number), str(folder))
+    finally:
+        os.close(descriptor)
+    return True
+
+
+def _linux_call(name: str) -> Callable[..., int] | None:
+    platform: str = sys.platform
+    return getattr(ctypes.CDLL(None, use_errno=True), name, None) if platform == "linux" else None
+
+
 def _sync_folder(folder: Path) -> None:
-    """Wait until all of a folder is on the disk: after a power cut, what has a name has its content."""
     inside = [path for place, _, files in os.walk(folder) for path in (Path(place), *(Path(place, f) for f in files))]
     # A few at a time: the disk then waits for several of them at once; to start a thread for each takes longer.
     failed: list[OSError] = []
