@@ -50,7 +50,7 @@ READING = (
     Row("sensors", "--sensors", "What the agent of a .pt observes: 8,20x4,3x84x84.", "SHAPE,..."),
     Row("activation", "--activation", "Activation between the layers of a bare .pt: elu, tanh, …", "NAME"),
     Row("script", "--script", "Script that saved a bare .pt: ppo-pytorch-continuous, …", "NAME"),
-    Row("repair", "--repair", "Mend an exporter's fault: gru-reset, log-sigmoid.", "NAME"),
+    Row("repair", "--repair", "Mend an exporter's fault: gru-reset, antialias, …", "NAME"),
     Row("normaliser", "--normaliser", "Statistics of a .zip: vecnormalize.pkl, if not next to it.", "FILE", FILE),
     Row("interface", "--interface", "YAML that states the interface (default: beside), or none.", "FILE", FILE),
     Row("trust_source", "--trust-source", "Let Keras or PyTorch load a file whole: its code can run.", both=True),

@@ -9,7 +9,7 @@ import onnx
 import pytest
 
 import export_model
-from export_model.converters.formats.onnx.exporters import FAULTS
+from export_model.converters.formats.onnx.exporters import FAULTS, faulty_nodes
 from export_model.converters.formats.source import ReadOptions
 from export_model.converters.runtimes.pool import RuntimePool
 from export_model.exporter.export.sources import read_source
@@ -45,12 +45,29 @@ def test_the_fault_is_named_with_its_evidence_and_the_repair_with_the_policy() -
     assert mended.startswith("repaired, gru-reset: ")
 
 
-def test_a_repaired_export_agrees_with_the_repaired_original_and_says_so(tmp_path: Path) -> None:
-    read = export_model.ReadOptions(repair="gru-reset")
-    (result,) = export_model.export(GRU, tmp_path, read=read, verify="onnxruntime")
+@pytest.mark.parametrize("name", [fault.name for fault in FAULTS])
+def test_a_repaired_export_agrees_with_the_repaired_original_and_says_so(name: str, tmp_path: Path) -> None:
+    file = FIXTURES / f"exporters/{name.replace('-', '_')}.onnx"
+    read = export_model.ReadOptions(repair=name)
+    (result,) = export_model.export(file, tmp_path, read=read, verify="onnxruntime")
     assert result.passed
-    again = export_model.verify(result.folder, source=GRU, verify="onnxruntime")
+    assert any(note.startswith(f"repaired, {name}: ") for note in result.policy.signature.notes)
+    again = export_model.verify(result.folder, source=file, verify="onnxruntime")
     assert again.passed
+    assert again.original == "onnxruntime"
+
+
+@pytest.mark.parametrize(("name", "where"), [("pixel-unshuffle", "SpaceToDepth"), ("pool-divisor", "AveragePool")])
+def test_what_the_exporter_notes_of_a_right_file_is_no_warning(name: str, where: str, tmp_path: Path) -> None:
+    """One channel cannot be exchanged, and a divisor that is the window's size is none."""
+    model = onnx.load(FIXTURES / f"exporters/{name.replace('-', '_')}.onnx")
+    node = next(n for n in model.graph.node if n.op_type == where)
+    call = next(p for p in node.metadata_props if p.key == "pkg.torch.onnx.fx_node")
+    call.value = call.value.replace("True, 3)", "True, 4)")
+    for value in model.graph.value_info:
+        if value.name == node.input[0]:
+            value.type.tensor_type.shape.dim[1].dim_value = 1
+    assert not list(faulty_nodes(model))
 
 
 def test_the_wrong_file_and_the_repaired_one_differ(tmp_path: Path, pool: RuntimePool) -> None:
