@@ -169,7 +169,7 @@ def _number(value: float) -> str:
 
 
 def _worst(cell: Mapping[str, Any] | None) -> str:
-    return "" if cell is None else f"{_number(cell['worst'])} ({_number(cell['median'])})"
+    return "" if cell is None else f"{_number(cell['worst'])}/{_number(cell['median'])}"
 
 
 def _row(cells: Iterable[object]) -> str:
@@ -227,7 +227,7 @@ def page(content: Mapping[str, Any]) -> str:
         "## Worst difference",
         "",
         "The largest |a − b| of any element of any output, over all inputs: also those of ±1e3, where outputs are "
-        "thousands and the bound is relative. In brackets the median of the policies' own worst.",
+        "thousands and the bound is relative. Behind the stroke the median of the policies' own worst.",
         "",
         *_table(
             ["format", "runtime", *(f"{KINDS[k]} ({content['kinds'][k]})" for k in kinds)],
@@ -320,17 +320,9 @@ def _litert(counted: Mapping[str, Any]) -> list[str]:
     return [
         "## LiteRT",
         "",
-        f"Counted on {counted['date']} by `python -m tests.figures --litert`, on {counted['files']} of these files.",
-        "",
-        *_table(
-            [
-                "policies written as ONNX",
-                "as `.tflite`",
-                "agree in LiteRT, with XNNPACK and without",
-                "the same bytes when read and written again",
-            ],
-            [[counted["onnx"], counted["written"], counted["agree"], counted["same"]]],
-        ),
+        f"Counted on {counted['date']} by `python -m tests.figures --litert`, on {counted['files']} of these files: "
+        f"{counted['onnx']} policies are written as ONNX, {counted['written']} as `.tflite`, {counted['agree']} agree "
+        f"in LiteRT, with XNNPACK and without, {counted['same']} are the same bytes when read and written again. "
         f"Refused: {refused}. Not in agreement: {', '.join(counted['failed']) or 'none'}.",
         "",
     ]
@@ -359,11 +351,14 @@ def _programs(counted: Mapping[str, Any]) -> list[str]:
         "masks, memory over steps, and draws by distribution.",
         "",
         *_table(
-            ["`--to`", "compiled and run by", "written", "agree", "with draws", "the original ran beside it"],
-            [
-                [f"`{key}`", counted["judges"][key], c["written"], c["agree"], c["draws"], c["original"]]
-                for key, c in rows.items()
-            ],
+            ["`--to` (compiled and run by)", "written", "agree", "with draws", "the original ran beside it"],
+            _joined(
+                [
+                    [f"`{key}` ({counted['judges'][key]})", c["written"], c["agree"], c["draws"], c["original"]]
+                    for key, c in rows.items()
+                ],
+                0,
+            ),
         ),
         f"Refused: {refused or 'none'}. "
         f"Not in agreement: {', '.join(f for c in rows.values() for f in c['failed']) or 'none'}.",
