@@ -165,9 +165,7 @@ def dependent(deviations: Sequence[np.ndarray], largest: float = 3.0) -> int:
     for each in deviations:
         spectrum = np.abs(np.fft.rfft(each, 2 * count, axis=0)) ** 2
         together += np.fft.irfft(spectrum.sum(axis=1), 2 * count)[:count]
-        # the covariance's norm, which is that of the smaller product
-        products = each.T @ each if each.shape[1] < count else each @ each.T
-        squares += float(np.square(products).sum()) / count**2
+        squares += float(np.square(each.T @ each).sum()) / count**2
     variance, sums = np.arange(count, 0, -1) * squares, np.abs(together)
     with np.errstate(divide="ignore", invalid="ignore"):
         exponents = np.where(sums > 0, sums**2 / (2 * (variance + sums * largest / 3)), 0.0)
@@ -194,7 +192,7 @@ def ranks(values: np.ndarray) -> np.ndarray:
     made = np.empty(values.shape)
     for column, each in enumerate(values.T):
         _, place, counts = np.unique(each, return_inverse=True, return_counts=True)
-        middle = np.cumsum(counts) - (counts - 1) / 2
+        middle = np.cumsum(counts) - counts / 2
         made[:, column] = middle[place.reshape(-1)]
     made -= made.mean(axis=0)
     spread = made.std(axis=0)
