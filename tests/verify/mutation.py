@@ -257,9 +257,9 @@ def _fork_map(files: dict[Path, list[pytest.Item]], folder: Path) -> int:
             measured.stop()
             file.write_text(json.dumps({"lines": _lines(measured, own, seconds), "seconds": seconds}))
         status = 0
-    except BaseException:
-        traceback.print_exc()
     finally:
+        if status:
+            traceback.print_exc()
         os._exit(status)
 
 
