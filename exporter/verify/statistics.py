@@ -148,6 +148,15 @@ def uniform_fit(shares: np.ndarray) -> float:
     return min(1.0, max(0.0, 2 * math.fsum(terms)))
 
 
+def spread_fit(shares: np.ndarray) -> float:
+    """The p-value of ``shares`` [n] being as spread as uniform ones, by Bernstein's inequality.
+
+    Kolmogorov's test is nearly blind in the tails: of 4,096 draws it saw no noise that was a seventh too wide.
+    """
+    off = abs(float((12 * np.square(shares - 0.5) - 1).sum()))  # terms of variance 0.8, at most 2
+    return min(1.0, 2 * math.exp(-(off**2) / (2 * (0.8 * shares.size + 2 * off / 3))))
+
+
 def _ahead(a: np.ndarray, b: np.ndarray, atol: float, rtol: float) -> int:
     """How many more of sorted ``a`` than of sorted ``b`` are at most x, at worst, b's being given the tolerance."""
     below = np.searchsorted(b, a + atol + rtol * np.abs(a), side="right")

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from export_model.converters.compiler.compile import compile_graph
 from export_model.converters.compiler.options import CompileOptions
 from export_model.converters.formats.frozen_graph.reader import read_graph
+from export_model.converters.formats.registry import FROZEN_GRAPH
 from export_model.converters.policy.policy import Policy
 from export_model.converters.runtimes.numpy import child
 from export_model.converters.runtimes.registry import RuntimeInfo
@@ -89,6 +90,59 @@ def judge(
 
     session = Session(("numpy", runtime), KNOWN, Pool(), options or VerifyOptions())  # type: ignore[arg-type]
     return verify(tested, session, participants, inputs, checks)
+
+
+class Lying(Model):
+    """A model that says ``spoil`` of what the kernels answer, of inner tensors too."""
+
+    def __init__(self, path: str, spoil: Spoil) -> None:
+        super().__init__(path)
+        self._spoil = spoil
+
+    def run(self, feeds: Feeds, fetch: Sequence[str], **request: Any) -> Arrays:
+        return self._spoil(feeds, super().run(feeds, fetch, **request))
+
+    def __enter__(self) -> Lying:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        pass
+
+
+def judge_file(
+    policy: Policy,
+    folder: Path,
+    spoil: Spoil = lambda feeds, answers: answers,
+    *,
+    again: Spoil | None = None,
+    checks: Sequence[Check] = CHECKS,
+    options: VerifyOptions | None = None,
+    seeded: bool = False,
+) -> ParityReport:
+    """As ``judge``, of a frozen graph that can be looked into: its samplers are cut, its tensors fetched.
+
+    ``again`` is what a runtime says that is started anew.
+    """
+    tested = policy_under_test(policy, {}, folder, sizes={}, seeded=seeded)
+
+    def load(pool: object, answered: bool) -> tuple[Any, Any]:
+        model = Lying(str(tested.reference), again or spoil)
+        return model, model.run_all
+
+    def participants(numpy: Any, failed: object) -> Iterator[Participant]:
+        model = Lying(str(tested.reference), spoil)
+        yield Participant(
+            format=FROZEN_GRAPH.key,
+            runtime="onnxruntime",
+            run=model.run_all,
+            outputs=[s.name for s in policy.signature.outputs],
+            model=model,  # type: ignore[arg-type]
+            path=tested.reference,
+            again=None if again is None else load,  # type: ignore[arg-type]
+        )
+
+    session = Session(("numpy", "onnxruntime"), KNOWN, Pool(), options or VerifyOptions())  # type: ignore[arg-type]
+    return verify(tested, session, participants, None, checks)
 
 
 def wrong(report: ParityReport) -> set[tuple[str, str]]:

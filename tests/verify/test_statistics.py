@@ -20,6 +20,7 @@ from export_model.exporter.verify.statistics import (
     normal_fit,
     ranks,
     same_distribution,
+    spread_fit,
     uniform_fit,
 )
 
@@ -96,6 +97,22 @@ def test_uniform_numbers_are_as_likely_as_kolmogorovs_table_says(size: float, p_
 def test_what_is_as_even_as_can_be_is_uniform() -> None:
     assert uniform_fit((np.arange(100) + 0.5) / 100) == 1.0
     assert uniform_fit(np.zeros(100)) < 1e-60
+
+
+@pytest.mark.parametrize(("share", "off"), [(0.5, 1), (0.0, 2), (1.0, 2), (0.25, 0.25)])
+def test_uniform_numbers_are_spread_as_such(share: float, off: float) -> None:
+    """12·(u − ½)² is 1 on average, of variance 0.8, and at most 2 off that: Bernstein's bound."""
+    wanted = 2 * math.exp(-((10 * off) ** 2) / (2 * (8 + 2 * 10 * off / 3)))
+    assert spread_fit(np.full(10, share)) == pytest.approx(min(1, wanted))
+
+
+@pytest.mark.parametrize("times", [1.15, 1 / 1.15])
+def test_noise_that_is_a_seventh_too_wide_is_seen(times: float) -> None:
+    def below(values: Array) -> Array:
+        return np.array([math.erfc(-x / math.sqrt(2)) / 2 for x in values])
+
+    drawn = np.random.default_rng(0).standard_normal(4096)
+    assert spread_fit(below(drawn * times)) < FALSE_ALARM < 1e-3 < spread_fit(below(drawn))
 
 
 def _quantiles(n: int) -> Array:

@@ -12,7 +12,14 @@ from export_model.exporter.verify.checks.mixed import one_row_at_a_time
 from export_model.exporter.verify.checks.numbers import rank
 from export_model.exporter.verify.difference import Difference, wrong
 from export_model.exporter.verify.participants import Participant
-from export_model.exporter.verify.statistics import FALSE_ALARM, columns_related, dependent, fit_all, uniform_fit
+from export_model.exporter.verify.statistics import (
+    FALSE_ALARM,
+    columns_related,
+    dependent,
+    fit_all,
+    spread_fit,
+    uniform_fit,
+)
 
 #: Numbers of a sampler that are looked at, of one that makes many.
 _COLUMNS = 64
@@ -90,7 +97,7 @@ def _alone(
     if not np.isfinite(drawn).all():
         return wrong("NaN or infinity was drawn")
     odds = log_probs.get(sampler.tensor)
-    p_values = [uniform_fit(column) for column in shares.T]
+    p_values = [fits(column) for column in shares.T for fits in (uniform_fit, spread_fit)]
     if odds is not None:
         classes = drawn.reshape(len(drawn), -1).astype(int)
         if (classes < 0).any() or (classes >= odds.shape[1]).any():
