@@ -45,6 +45,8 @@ _PATIENCE, _SECONDS = 4, 4
 _MUTANT = "EXPORT_MODEL_MUTANT"
 
 Map = dict[str, dict[str, list[str]]]
+#: (module, qualified name) → the functions of that name.
+Functions = dict[tuple[str, str], list[FunctionType]]
 
 
 def survivors(chosen: Sequence[Mutant], tests: Sequence[str] = TESTS) -> Iterator[tuple[Mutant, str]]:
@@ -84,6 +86,10 @@ class Runner:
         items = {item.nodeid: item for item in session.items}
         order = {nodeid: i for i, nodeid in enumerate(items)}
         lines, seconds = self._map(session)
+        functions: Functions = defaultdict(list)
+        for each in gc.get_objects():
+            if isinstance(each, FunctionType):
+                functions[each.__module__, each.__qualname__].append(each)
         gc.collect()
         gc.freeze()
         print(f"\n{len(self.chosen)} mutants, {len(seconds)} tests", flush=True)
@@ -98,7 +104,8 @@ class Runner:
                 self._wait(running)
             limit = _SECONDS + _PATIENCE * sum(seconds[t] for t in tests)
             own = self.folder / str(mutant.number)
-            running[_fork(mutant, [items[t] for t in tests], limit, own)] = mutant, own
+            found = functions[mutant.module, mutant.function]
+            running[_fork(mutant, found, [items[t] for t in tests], limit, own)] = mutant, own
         while running:
             self._wait(running)
         shutil.rmtree(self.folder, ignore_errors=True)
@@ -168,7 +175,7 @@ def _prepare(items: Sequence[pytest.Item], folder: Path) -> None:
     """Begin the child's life: a process group, no output, temporary folders of its own."""
     os.setpgid(0, 0)
     folder.mkdir(parents=True)
-    quiet = os.open(os.environ.get("MUTANTS_LOG", os.devnull), os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+    quiet = os.open(os.devnull, os.O_WRONLY)
     os.dup2(quiet, 1)
     os.dup2(quiet, 2)
     factory = items[0].config._tmp_path_factory  # type: ignore[attr-defined]
@@ -180,14 +187,12 @@ def _run(items: Sequence[pytest.Item]) -> Iterator[tuple[pytest.Item, str]]:
     """Each test and what became of it: passed, failed or skipped."""
     for item, following in zip(items, [*items[1:], None], strict=True):
         reports = runtestprotocol(item, log=False, nextitem=following)
-        if any(r.failed for r in reports):
-            print(item.nodeid, [str(r.longrepr)[-3000:] for r in reports if r.failed], flush=True)
-            yield item, "failed"
-        else:
-            yield item, "skipped" if any(r.skipped for r in reports) else "passed"
+        yield item, next((word for word in ("failed", "skipped") if any(r.outcome == word for r in reports)), "passed")
 
 
-def _fork(mutant: Mutant, items: Sequence[pytest.Item], limit: float, folder: Path) -> int:
+def _fork(
+    mutant: Mutant, functions: Sequence[FunctionType], items: Sequence[pytest.Item], limit: float, folder: Path
+) -> int:
     """Start a process that ends with 0 where all tests pass."""
     child = os.fork()
     if child:
@@ -198,7 +203,7 @@ def _fork(mutant: Mutant, items: Sequence[pytest.Item], limit: float, folder: Pa
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
         seconds = int(limit)
         resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
-        if mutant.function and _break_in_place(mutant):
+        if _break_in_place(mutant, functions):
             status = 0 if all(became != "failed" for _, became in _run(items)) else 1
         else:
             arguments = [sys.executable, "-m", "tests.verify.mutation", *(item.nodeid for item in items)]
@@ -209,16 +214,11 @@ def _fork(mutant: Mutant, items: Sequence[pytest.Item], limit: float, folder: Pa
         os._exit(status)
 
 
-def _break_in_place(mutant: Mutant) -> bool:
-    """Give every function of that name the broken code; False where that cannot be."""
-    code = compile(broken(mutant), str(ROOT / mutant.file), "exec")
-    found = [
-        f
-        for f in gc.get_objects()
-        if isinstance(f, FunctionType) and f.__module__ == mutant.module and f.__qualname__ == mutant.function
-    ]
+def _break_in_place(mutant: Mutant, functions: Sequence[FunctionType]) -> bool:
+    """Give the functions the broken code; False where there is none, or it cannot be."""
+    code = compile(broken(mutant), str(ROOT / mutant.file), "exec") if mutant.function else None
     turned = 0
-    for function in found:
+    for function in functions if code is not None else ():
         for made in _codes(code):
             own = function.__code__
             same = made.co_qualname == own.co_qualname and made.co_firstlineno == own.co_firstlineno
