@@ -23,7 +23,7 @@ from export_model.signatures.roles import Role
 from export_model.signatures.spec import TensorSpec
 from tests.handmade import continuous_policy, sampled_policy
 from tests.verify.judged import compiled
-from tests.verify.test_judge import noisy
+from tests.verify.test_judge import branches, noisy
 
 B = None
 
@@ -88,6 +88,8 @@ def test_order_is_said_where_it_alone_decides() -> None:
     assert made.by_order == ("vector_observation",)
     sole = pair_policies(policy([vector("a", 3), vector("b", 4)]), policy([vector("y", 4), vector("x", 3)]))
     assert sole.inputs == {"a": "x", "b": "y"} and sole.by_order == ()
+    named = pair_policies(policy([vector("a", 3, "s")]), policy([vector("x", 3, "s"), vector("y", 3), vector("z", 3)]))
+    assert named.inputs == {"a": "x"} and named.by_order == ()
 
 
 @pytest.mark.parametrize("key", ["a", "one"])
@@ -114,6 +116,7 @@ def test_what_one_side_alone_has_is_said() -> None:
         ([vector("x", 1), vector("y", 2)], True),
         ([vector("x", 1), vector("y", 3)], False),
         ([vector("x", 1), vector("y", None)], False),
+        ([vector("x", 3), vector("y", None)], False),
         ([vector("x", 1), spec("y", Role.MASKS, 2)], False),
         ([spec("x", Role.VECTOR, 1, 1), vector("y", 2)], False),
         ([vector("x", 1), vector("y", 1), vector("z", 1)], True),
@@ -203,6 +206,9 @@ def test_drawn_actions_are_drawn_ones_and_plain_ones_plain() -> None:
 
 #: The action alone, as another tool writes it.
 BARE = policy(PLAIN.signature.inputs, PLAIN.signature.outputs[:1], PLAIN)
+NOISY_ALONE = policy(DRAWN.signature.inputs, DRAWN.signature.outputs[:1], DRAWN)
+SCORES = branches(0.5)
+SCORES_ALONE = policy(SCORES.signature.inputs, SCORES.signature.outputs[:1], SCORES)
 
 
 @pytest.mark.parametrize(
@@ -212,6 +218,7 @@ BARE = policy(PLAIN.signature.inputs, PLAIN.signature.outputs[:1], PLAIN)
         ((DRAWN, BARE), {"deterministic_action": "action"}),
         ((PLAIN, DRAWN), {"action": "deterministic_action", "deterministic_action": "deterministic_action"}),
         ((BARE, DRAWN), {"action": "deterministic_action"}),
+        ((NOISY_ALONE, PLAIN), {}),
     ],
 )
 def test_where_one_side_draws_what_is_without_chance_is_compared(
@@ -219,7 +226,7 @@ def test_where_one_side_draws_what_is_without_chance_is_compared(
 ) -> None:
     made = pair_policies(*sides)
     assert made.outputs == outputs
-    drawing, other = ("the reference", "the candidate") if sides[0] is DRAWN else ("the candidate", "the reference")
+    drawing, other = ("the reference", "the candidate") if draws(sides[0]) else ("the candidate", "the reference")
     assert [f"{drawing} draws action and {other} does not" in note for note in made.apart] == [True]
     assert made.incomparable == {Role.SAMPLED, Role.LOG_PROB, Role.CONTINUOUS}
 
@@ -229,6 +236,8 @@ def test_where_one_side_draws_what_is_without_chance_is_compared(
     [
         ((BARE, PLAIN), {"action": "action"}),
         ((PLAIN, BARE), {"action": "action", "deterministic_action": "action"}),
+        ((SCORES, SCORES_ALONE), {"action": "action"}),
+        ((SCORES_ALONE, SCORES), {"action": "action"}),
     ],
 )
 def test_an_action_without_chance_is_its_own_companion(sides: tuple[Policy, Policy], outputs: dict[str, str]) -> None:
@@ -254,7 +263,10 @@ def test_other_outputs_are_paired_by_role() -> None:
     theirs = policy(PLAIN.signature.inputs, [*PLAIN.signature.outputs, other], PLAIN)
     made = pair_policies(ours, theirs)
     assert made.outputs["value_estimate"] == "q" and len(made.reshaped) == 1 and "q is [B, 1, 1]" in made.reshaped[0]
+    assert pair_policies(theirs, ours, {"q": "action"}).outputs["q"] == "value_estimate", "actions are no others"
     memory = spec("m", Role.MEMORY_OUT, 1)
+    kept = policy(ours.signature.inputs, [*PLAIN.signature.outputs, memory], PLAIN)
+    assert pair_policies(ours, kept, {"value_estimate": "m"}).outputs["value_estimate"] == "m", "what a user says"
     assert (
         "value_estimate"
         not in pair_policies(ours, policy(ours.signature.inputs, [ours.signature.outputs[0], memory])).outputs
