@@ -93,16 +93,16 @@ class Original:
         parts: list[Arrays] = []
         lengths = []
         for feeds, count in zip(inputs, counts, strict=True):
-            whole = wanted is None or wanted == count
-            own = [feeds] if whole else [self._some_rows(feeds, i, wanted or 1) for i in range(0, count, wanted or 1)]
+            size = count if wanted is None else wanted
+            own = [feeds] if size == count else [self._some_rows(feeds, i, size) for i in range(0, count, size)]
             parts += own
             lengths.append(len(own))
         answers = iter(self._answers(parts))
         results = []
         for count, length in zip(counts, lengths, strict=True):
             first, *rest = [next(answers) for _ in range(length)]
-            joint = {name: np.concatenate([first[name], *(r[name] for r in rest)])[:count] for name in first}
-            results.append(joint if wanted is not None and wanted != count else first)
+            joint = {n: np.concatenate([a, *(r[n] for r in rest)])[:count] for n, a in first.items()}
+            results.append(first if wanted in (None, count) else joint)
         return results if self._then is None else [self._then(answer) for answer in results]
 
     def _some_rows(self, feeds: Arrays, first: int, count: int) -> dict[str, np.ndarray]:
@@ -146,7 +146,8 @@ class Original:
                 continue
             if spec.role is Role.LOG_PROBS:
                 results[spec.name] = np.concatenate([_log_softmax(p) for p in scores], axis=1)
-            elif spec.name not in self.plain and self.values is not None:
+            elif spec.name not in self.plain:
+                assert self.values is not None
                 results[spec.name] = np.argmax(results[self.values], axis=-1).reshape(-1, 1).astype(np.int64)
             else:
                 results[spec.name] = self._deterministic(self.plain[spec.name], feeds, results, scores)
@@ -169,7 +170,7 @@ class Original:
         if head.role in (Role.LOG_PROBS, Role.PROBS):
             edges = np.cumsum(self.signature.branches)[:-1]
             scores = np.split(results[head.name], edges, axis=1)
-        if head.role is Role.DETERMINISTIC or not scores:
+        if head.role is Role.DETERMINISTIC:
             value = results[head.name].astype(np.int64)
             return value.reshape(value.shape[0], -1)
         return np.stack([np.argmax(p, axis=1) for p in scores], axis=1).astype(np.int64)

@@ -23,6 +23,7 @@ from export_model.signatures.roles import Role
 from export_model.signatures.spec import TensorSpec
 from tests.handmade import continuous_policy, sampled_policy
 from tests.verify.judged import compiled
+from tests.verify.test_drawn import two_branches
 from tests.verify.test_judge import branches, noisy
 
 B = None
@@ -255,6 +256,17 @@ def test_what_follows_from_a_draw_is_compared_only_where_both_draw() -> None:
 def test_classes_are_no_numbers() -> None:
     assert not {"action", "deterministic_action"} & pair_policies(PLAIN, CLASSES).outputs.keys()
     assert not {"action", "deterministic_action"} & pair_policies(CLASSES, PLAIN).outputs.keys()
+    two = two_branches()
+    for pair in ((PLAIN, two), (two, PLAIN)):
+        assert "deterministic_action" not in pair_policies(*pair).outputs, "of one shape, and of one role"
+
+
+def test_actions_of_other_roles_are_compared_without_chance_alone() -> None:
+    bare = replace(PLAIN.signature.outputs[0], role=Role.DETERMINISTIC)
+    chosen = policy(PLAIN.signature.inputs, [bare], PLAIN)
+    assert pair_policies(chosen, BARE).outputs == {"action": "action"}
+    scores = policy(SCORES.signature.inputs, [replace(SCORES.signature.outputs[0], role=Role.PROBS)], SCORES)
+    assert pair_policies(SCORES_ALONE, scores).outputs == {}
 
 
 def test_other_outputs_are_paired_by_role() -> None:

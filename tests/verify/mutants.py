@@ -6,8 +6,8 @@ that was killed with its interval. By hand, or nightly: a mutant takes about a s
 
 Left out by rule, as no test of what is judged can tell them: text, annotations, ``raise`` and ``assert``, what a
 function that returns one text says (unless its docstring says that the text may be empty, which decides something),
-``strict=`` of zip, ``copy=`` of arrays, the state of numpy's warnings, options of a decorator or a base class, and
-what is there for the type checker.
+the seed of a generator, the sizes that an array is brought to by reshape, ``strict=`` of zip, ``copy=`` of arrays,
+the state of numpy's warnings, options of a decorator or a base class, and what is there for the type checker.
 """
 
 from __future__ import annotations
@@ -38,6 +38,7 @@ _COMPARED = {
 }
 _COMPUTED = {ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.BitAnd: ast.BitOr}
 _NAMES = {"any": "all", "all": "any", "min": "max", "max": "min", "maximum": "minimum", "minimum": "maximum"}
+_UNTOLD = ("default_rng", "reshape")
 _KEYWORDS = ("strict", "copy", "divide", "invalid", "over", "stacklevel", "encoding")
 
 
@@ -119,6 +120,9 @@ class _Breaker(ast.NodeTransformer):
         if isinstance(node, ast.arg | ast.JoinedStr | ast.Raise | ast.Assert | ast.ImportFrom) or _is_text(node):
             return node
         if isinstance(node, ast.keyword) and node.arg in _KEYWORDS:
+            return node
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in _UNTOLD:
+            node.func = self.visit(node.func)  # type: ignore[assignment]
             return node
         if isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING"):
             return node

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
+from msgspec.structs import replace
 
 from export_model.converters.files.children.process import RunFailedError
 from export_model.exporter.verify.original import MAX_ROWS, Original
@@ -138,6 +139,16 @@ def test_memories_of_several_parts_are_one_row() -> None:
     assert source.fed[0]["h:0"].shape == (1, 3, 2) and "recurrent_in" not in source.fed[0]
 
 
+def test_a_memory_of_one_agent_has_no_rows() -> None:
+    kept = TensorSpec("recurrent_in", Role.MEMORY_IN, "float32", (B, 2))
+    given = TensorSpec("recurrent_out", Role.MEMORY_OUT, "float32", (B, 2))
+    parts = {"recurrent_in": (SourcePart("h:0", (B, 2)),), "recurrent_out": (SourcePart("h_out:0", (B, 2)),)}
+    source = Source(lambda feeds: {"h_out:0": feeds["h:0"][0] + 10})
+    signed = signature([given], [kept], memory=Memory(size=2, input="recurrent_in", output="recurrent_out"))
+    answers = original(source, signed, {}, parts=parts, rows=1).run({"state": X, "recurrent_in": X})
+    np.testing.assert_array_equal(answers["recurrent_out"], X + 10)
+
+
 # ------------------------------------------------------------------ classes
 
 LOGITS = np.array([[1, 3, 2, 0, 5], [9, -9, 0, 4, 1], [0, 0, 8, 2, 3]], np.float32)
@@ -166,6 +177,21 @@ def test_odds_and_the_best_classes_follow_from_logits() -> None:
     np.testing.assert_allclose(np.log(odds[:, 1] / odds[:, 0]), LOGITS[:, 1] - LOGITS[:, 0], rtol=1e-4)
     np.testing.assert_allclose(np.log(odds[:, 4] / odds[:, 3]), LOGITS[:, 4] - LOGITS[:, 3], rtol=1e-4)
     assert answers["action_log_probs"].dtype == np.float32 and "drawn:0" not in source.asked[0]
+
+
+def test_what_the_source_gives_is_not_derived() -> None:
+    source = Source(logits)
+    signed = signature([SAMPLED, LOG_PROBS, BEST], space="discrete", branches=(3, 2))
+    fetches = {"action_log_probs": "p:0", "deterministic_action": "best:0"}
+    answers = original(source, signed, fetches, branches=("a:0", "b:0")).run({"state": -X})
+    assert answers["action_log_probs"].tolist() == LOGITS.tolist()
+
+
+def test_large_logits_have_odds() -> None:
+    source = Source(lambda feeds: {"a:0": np.array([[1000, 1001, -1000]], np.float32), "b:0": np.zeros((1, 2))})
+    signed = signature([SAMPLED, LOG_PROBS], space="discrete", branches=(3, 2))
+    (odds,) = original(source, signed, {}, branches=("a:0", "b:0")).run({"state": X[:1]})["action_log_probs"]
+    np.testing.assert_allclose(odds, [-1.313262, -0.313262, -2001.313262, -0.693147, -0.693147], rtol=1e-6)
 
 
 @pytest.mark.parametrize("tensors", [(), ("a:0", None)])
@@ -201,6 +227,13 @@ def test_the_action_is_the_best_value_where_the_source_has_no_other() -> None:
     assert made.output_names == {"action", "q_values"}
     assert made.run({"state": X})["action"].tolist() == [[4], [0], [2]]
     assert original(Source(logits), signed, {}).output_names == frozenset()
+    both = signature([chosen, values, replace(chosen, name="deterministic_action")], space="discrete", branches=(5,))
+    answers = original(Source(logits), both, {"q_values": "q:0"}).run({"state": X})
+    assert answers["deterministic_action"].tolist() == [[4], [0], [2]]
+    third = replace(chosen, name="action", source="drawn:0")
+    told = signature([third, values, replace(chosen, name="deterministic_action")], space="discrete", branches=(5,))
+    answers = original(Source(logits), told, {"q_values": "q:0", "action": "drawn:0"}).run({"state": X})
+    assert not answers["deterministic_action"].any(), "what it does, whatever its values"
     own = signature([TensorSpec("action", Role.DETERMINISTIC, "int64", (B, 1), "z:0"), values], space="discrete")
     assert original(Source(logits), own, {"q_values": "q:0"}).output_names == {"q_values"}, "it has its own"
     numbers = signature([out("action", Role.DETERMINISTIC, 1), values])
@@ -229,6 +262,11 @@ def test_a_source_of_one_agent_has_no_rows() -> None:
     answers = made.run({"state": X})
     np.testing.assert_array_equal(answers["action"], 2 * X)
     np.testing.assert_array_equal(answers["value_estimate"], X.sum(axis=1, keepdims=True))
+    turned = Source(lambda feeds: {"y:0": feeds["x:0"].T})
+    assert original(turned, signature([ACTION]), {"action": "y:0"}, rows=1).run({"state": X[:1]})["action"].shape == (
+        2,
+        1,
+    )
     many = original(source, signature([ACTION]), {"action": "y:0"})
     assert many.run({"state": X})["action"].shape == (2,), "a fault of many rows is compared as it is"
 
