@@ -1,8 +1,9 @@
 """``python -m tests.faults``: faults of every class, planted into what export writes for policies of every family.
 
 Without flags a sample of policies of fixtures/, as ``make test`` has it. ``--whole`` has every class once in every
-policy of fixtures/ and ../shared (hours), ``--every`` every tensor that can have it; ``--write`` keeps the table in
-docs/figures.json, from which docs/figures.md is written.
+policy of fixtures/ and ../shared (hours), each of ../shared written in one of many ways by ``--seed``; ``--policies 9``
+takes nine of each family, ``--faults 5`` five classes for each policy, those that its family had least; ``--every``
+has every tensor that can have it. ``--write`` keeps the table in docs/figures.json, which docs/figures.md is made of.
 """
 
 from __future__ import annotations
@@ -10,12 +11,13 @@ from __future__ import annotations
 import argparse
 import datetime
 import json
+import random
 import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
-from itertools import chain
+from itertools import chain, zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +39,16 @@ def sample(given: Iterable[Member]) -> list[Member]:
         how = sorted(str(v) for v in member.more.values())
         found.setdefault(f"{member.family} {member.form} {how}", member)
     return list(found.values())
+
+
+def some(given: Iterable[Member], count: int, seed: int) -> list[Member]:
+    """``count`` members of every family, by chance, the families in turn."""
+    families: dict[str, list[Member]] = {}
+    for member in given:
+        families.setdefault(member.family, []).append(member)
+    rng = random.Random(seed)
+    chosen = [rng.sample(f, min(count, len(f))) for f in families.values()]
+    return [m for turn in zip_longest(*chosen) for m in turn if m is not None]
 
 
 class Turns:
@@ -66,10 +78,11 @@ def outcomes(
     *,
     count: int | None = None,
     every: bool = False,
+    sound: bool = False,
     ways: Sequence[str] = (),
     turns: Turns | None = None,
 ) -> Iterator[Outcome]:
-    """What comes of each fault, each judged in one way in turn (``ways``: in these); a policy without one first."""
+    """What comes of each fault, judged in one way in turn (``ways``: in these); if ``sound``, of none at first."""
     turns = turns or Turns()
     for number, member in enumerate(given):
         with tempfile.TemporaryDirectory() as folder:
@@ -79,16 +92,16 @@ def outcomes(
                 continue
             possible = [w for w in subject.ways() if not ways or w in ways]
             faults = list(subject.faults())
-            sound = {way: subject.judge(None, way) for way in possible} if count is None else {}
-            yield from sound.values()
-            possible = [w for w in possible if w not in sound or sound[w].verdict == "passed"]
+            right = {way: subject.judge(None, way) for way in possible} if sound else {}
+            yield from right.values()
+            possible = [w for w in possible if w not in right or right[w].verdict == "passed"]
             for place, fault in enumerate(faults if every else turns.choose(member.family, faults, count)):
                 for way in possible if ways else possible[(number + place) % max(len(possible), 1) :][:1]:
                     yield subject.judge(fault, way)
 
 
-def counted(found: Sequence[Outcome]) -> dict[str, Any]:
-    """The table, as JSON: families → classes → [caught, located, planted]; what was missed, and what has no effect."""
+def counted(found: Sequence[Outcome], command: str) -> dict[str, Any]:
+    """The table of ``command``, as JSON: families → classes → [caught, located, planted], and what was missed."""
     cells: dict[str, dict[str, list[int]]] = {}
     for each in (o for o in found if o.verdict in ("caught", "missed") and o.kind != "no fault"):
         cell = cells.setdefault(each.family, {}).setdefault(each.kind, [0, 0, 0])
@@ -96,11 +109,12 @@ def counted(found: Sequence[Outcome]) -> dict[str, Any]:
         cell[1] += each.located
         cell[2] += 1
     return {
+        "command": command,
         "date": datetime.datetime.now(tz=datetime.UTC).date().isoformat(),
         "policies": len({o.member for o in found}),
         "cells": cells,
         "missed": [asdict(o) for o in found if o.verdict == "missed"],
-        "without_effect": [f"{o.member}: {o.kind} at {o.tensor}" for o in found if o.verdict == "no effect"],
+        "without_effect": sum(o.verdict == "no effect" for o in found),
         "alarms": [str(o) for o in found if o.kind == "no fault" and o.verdict != "passed"],
     }
 
@@ -109,21 +123,30 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.faults", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--whole", action="store_true", help="every class in every policy of fixtures/ and ../shared")
     parser.add_argument("--every", action="store_true", help="every class at every tensor that can have it")
+    parser.add_argument("--seed", type=int, default=0, help="chooses policies, and how each is written")
+    parser.add_argument("--policies", type=int, help="so many of every family")
+    parser.add_argument("--faults", type=int, help="so many classes of each policy")
     parser.add_argument("--only", default="", help="only policies whose family, name or format holds this")
     parser.add_argument("--ways", default="", help="export, verify, compare: each fault in all of these")
     parser.add_argument("--write", action="store_true", help="keep the table in docs/figures")
     options = parser.parse_args()
-    given = chain(members(), shared()) if options.whole else members() if options.only else sample(members())
+    given = (
+        chain(members(), shared(options.seed)) if options.whole else members() if options.only else sample(members())
+    )
     given = (m for m in given if options.only in f"{m.family} {m.label}")
+    if options.policies is not None:
+        given = some(given, options.policies, options.seed)
     found = []
     with RuntimePool() as pool:
         ways = [w for w in options.ways.split(",") if w]
-        count = None if options.whole or options.only else SAMPLED
-        for outcome in outcomes(given, pool, count=count, every=options.every, ways=ways):
+        sound = options.whole or bool(options.only)
+        count = options.faults or (None if sound else SAMPLED)
+        for outcome in outcomes(given, pool, count=count, every=options.every, sound=sound, ways=ways):
             found.append(outcome)
             if outcome.verdict in ("missed", "no effect") or (outcome.kind, outcome.verdict) == ("no fault", "caught"):
                 print(outcome, flush=True)
-    content = counted(found)
+    words = [a for a in sys.argv[1:] if a != "--write"]
+    content = counted(found, " ".join(["python -m tests.faults", *words]))
     if options.write:
         before = json.loads(FIGURES.read_text(encoding="utf-8"))
         kept = {**before, "faults": content}
@@ -132,7 +155,7 @@ def main() -> int:
     caught, located, planted = totals(content)
     print(
         f"{planted} faults in {content['policies']} policies: {caught} caught, {located} located, "
-        f"{planted - caught} missed; {len(content['without_effect'])} more change nothing; "
+        f"{planted - caught} missed; {content['without_effect']} more change nothing; "
         f"{len(content['alarms'])} alarms without a fault"
     )
     return 1 if content["missed"] or content["alarms"] else 0

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import random
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.consumers.profiles import PROFILES
+from export_model.converters.consumers.robots.naming import GODOT_RL, ISAAC_LAB
 from export_model.converters.formats.source import ReadOptions
 from export_model.exporter.export.pipeline import ExportOptions, export
 from fixtures import FOLDER
@@ -170,10 +173,25 @@ _TRAINERS = {
 }
 
 
-def shared() -> Iterator[Member]:
-    """The policies of ../shared, each in one format; drawing ones for Unity too."""
-    forms = ("onnx", "onnx", "onnx", "litert", "js", "c")
-    for number, file in enumerate(sources()):
+_ROBOTS = (ISAAC_LAB, GODOT_RL)
+#: Ways to write a policy of ../shared: the family that it counts for (None: the source's own), format, options.
+WRITINGS: tuple[tuple[str | None, str, Mapping[str, Any]], ...] = (
+    *((None, form, {}) for form in ("onnx", "bytes", "saved_model", "tfjs", "onnx", "bytes", "tfjs", "onnx")),
+    (".nn", "nn", {}),
+    *(("LiteRT", "litert", {}) for _ in range(2)),
+    *(("source code", form, {}) for form in ("c", "js", "csharp")),
+    ("int8, float16", "onnx", {"weights": "int8"}),
+    ("int8, float16", "tfjs", {"weights": "float16"}),
+    *(("profiles", form, {"profile": p.name}) for p in PROFILES for form in p.formats if p.name not in _ROBOTS),
+    *(("profiles", form, {"compile": CompileOptions(noise="keep")}) for form in ("onnx", "bytes", "tfjs", "litert")),
+)
+
+
+def shared(seed: int = 0) -> Iterator[Member]:
+    """The policies of ../shared, each written in one of the ways, by chance; those for robots for their loaders too."""
+    rng = random.Random(seed)
+    others = [p for p in sorted((SHARED / "corpus4").glob("*")) if p.suffix != ".jsonl"]
+    for file in [*sources(), *others]:
         room = file.relative_to(SHARED).parts[0]
         family = _TRAINERS.get(file.name.split("_")[0], "robots")
         if file.suffix == ".nn":
@@ -183,6 +201,7 @@ def shared() -> Iterator[Member]:
         elif room == "corpus":
             family = "trained Unity files"
         name = "/".join(file.relative_to(SHARED).parts[1:])[-60:]
-        yield Member(family, name, _is(file), forms[number % len(forms)])
-        if family in ("ML-Agents PyTorch", "trained Unity files") and file.suffix == ".onnx":
-            yield Member("profiles", name, _is(file), more={"profile": ("unity6", "barracuda-3")[number % 2]})
+        written, form, more = rng.choice(WRITINGS)
+        yield Member(written or family, name, _is(file), form, more=more)
+        if family in ("rsl_rl", "robots"):
+            yield Member("profiles", name, _is(file), more={"profile": rng.choice(_ROBOTS)})

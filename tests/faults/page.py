@@ -8,36 +8,35 @@ from typing import Any
 
 def totals(counted: Mapping[str, Any]) -> tuple[int, int, int]:
     """(caught, located, planted) of all faults."""
-    cells = [cell for row in counted["cells"].values() for cell in row.values()]
-    caught, located, planted = (sum(cell[i] for cell in cells) for i in range(3))
+    caught, located, planted = (sum(column) for column in zip(*map(_family, counted["cells"].values()), strict=True))
     return caught, located, planted
 
 
 def section(counted: Mapping[str, Any]) -> list[str]:
     """The section on planted faults."""
-    caught, located, planted = totals(counted)
-    cells = counted["cells"]
-    kinds = list(dict.fromkeys(kind for row in cells.values() for kind in row))
     missed = [f"{m['member']}: {m['kind']} at {m['tensor'] or 'the file'}, by {m['way']}" for m in counted["missed"]]
+    rows = {family: _family(cells) for family, cells in counted["cells"].items()}
+    rows["all"] = totals(counted)
     return [
         "## Planted faults",
         "",
-        f"Planted on {counted['date']} by `python -m tests.faults`: {planted} faults in what was written for "
-        f"{counted['policies']} policies, each judged by `export`, `verify --source` or `compare` in turn. {caught} "
-        f"were caught, of {located} the place was named, {planted - caught} were missed; of "
-        f"{len(counted['without_effect'])} more no number changes beyond the tolerance, and no decision, at 4,096 of "
-        "the policy's own inputs. A cell has those caught of those planted.",
+        f"Planted on {counted['date']} by `{counted['command']}` into {counted['policies']} policies, judged by "
+        f"`export`, `verify --source` and `compare` in turn; {counted['without_effect']} more change nothing at 4,096 "
+        "of the policy's own inputs. *Located*: its tensor or function is named.",
         "",
-        "| fault | " + " | ".join(cells) + " |",
-        "|" + "---|" * (len(cells) + 1),
-        *(f"| {kind} | " + " | ".join(_cell(row.get(kind)) for row in cells.values()) + " |" for kind in kinds),
+        "| family | caught | located | missed |",
+        "|---|---|---|---|",
+        *(
+            f"| {name} | {caught} | {located} | {planted - caught} |"
+            for name, (caught, located, planted) in rows.items()
+        ),
         "",
         f"Missed: {'; '.join(missed) or 'none'}.",
-        "",
-        f"Without an effect: {'; '.join(counted['without_effect']) or 'none'}.",
         "",
     ]
 
 
-def _cell(cell: list[int] | None) -> str:
-    return "" if cell is None else f"{cell[0]}/{cell[2]}"
+def _family(cells: Mapping[str, list[int]]) -> tuple[int, int, int]:
+    """(caught, located, planted) of one family's classes."""
+    caught, located, planted = (sum(cell[i] for cell in cells.values()) for i in range(3))
+    return caught, located, planted
