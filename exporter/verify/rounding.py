@@ -20,6 +20,7 @@ from export_model.converters.graph.nodes import Graph
 from export_model.converters.graph.run import run_graph
 from export_model.converters.runtimes.registry import RUNTIMES
 from export_model.exporter.verify.difference import steps
+from export_model.exporter.verify.excuses import FLOAT64, NAN_FROM_ZERO, NOT_FROM_ZERO, Excuse
 from export_model.exporter.verify.participants import Feeds
 from export_model.exporter.verify.tolerances import Tolerance
 from export_model.signatures.sampling import Case
@@ -139,13 +140,27 @@ class Hull(Struct, frozen=True):
     """Between what an answer lies where numbers rest on what is not told from zero.
 
     That is what both ends, float64 and the reference make of them, and as far again beyond, as what is computed from
-    several of them has no order. ``open`` and ``nan`` say where the ends are apart, and where one of them is NaN.
+    several of them has no order. ``open`` and ``nan`` say where the ends are apart, and where one of them is NaN;
+    ``whole`` is what float64 makes of it.
     """
 
     open: np.ndarray
     nan: np.ndarray
     low: np.ndarray
     high: np.ndarray
+    whole: np.ndarray
+
+    def forgive(self, answer: np.ndarray, reference: np.ndarray, *, ordinary: bool) -> list[tuple[Excuse, np.ndarray]]:
+        """Mark what is forgiven of an answer: at ordinary inputs what float64 says itself, and nothing else."""
+        if ordinary:
+            default = Tolerance()
+            with np.errstate(invalid="ignore"):
+                near = np.abs(answer - self.whole) <= default.atol + default.rtol * np.abs(self.whole)
+            return [(FLOAT64, self.open & near & np.isfinite(self.whole))]
+        numbers = np.isfinite(answer), np.isfinite(reference)
+        none = self.nan & ~(numbers[0] | numbers[1])
+        one = self.nan & (numbers[0] ^ numbers[1])
+        return [(NOT_FROM_ZERO, self.holds(answer) | none), (NAN_FROM_ZERO, one)]
 
     def holds(self, answer: np.ndarray) -> np.ndarray:
         """Where an answer is one of those."""
@@ -155,7 +170,7 @@ class Hull(Struct, frozen=True):
 
 def hull(ends: Sequence[np.ndarray], reference: np.ndarray, rounding: np.ndarray | float) -> Hull:
     """Return what ``ends`` say of an output: of numbers as zero, kept, and in float64."""
-    zero, kept, _ = (e.astype(np.float64) for e in ends)
+    zero, kept, whole = (e.astype(np.float64) for e in ends)
     default = Tolerance()
     with np.errstate(invalid="ignore"):
         apart = ~(np.abs(zero - kept) <= default.atol + default.rtol * np.abs(kept)) & (zero != kept)
@@ -167,4 +182,4 @@ def hull(ends: Sequence[np.ndarray], reference: np.ndarray, rounding: np.ndarray
     apart &= ~(nan[0] & nan[1])
     nothing = np.isnan(low)
     low, high = np.where(nothing, -np.inf, low - beyond), np.where(nothing, np.inf, high + beyond)
-    return Hull(apart, apart & (nan[0] | nan[1]), low, high)
+    return Hull(apart, apart & (nan[0] | nan[1]), low, high, whole)

@@ -35,7 +35,6 @@ from export_model.exporter.verify.difference import (
 )
 from export_model.exporter.verify.excuses import (
     CHAOS,
-    NAN_FROM_ZERO,
     NEVER,
     NO_DEVIATION,
     NOT_FROM_ZERO,
@@ -230,17 +229,18 @@ class Trial:
         return replace(other, forgiven=(Forgiven(TIE, int(turned.sum()), most), *other.forgiven))
 
     def _ends(self, asked: Question) -> Difference | None:
-        """Held against what comes of numbers that are not told from zero; None at ordinary inputs."""
-        if not isinstance(asked.at, Case) or asked.at.ordinary:
+        """Held against what comes of numbers that are not told from zero: at ordinary inputs in float64 alone."""
+        if not isinstance(asked.at, Case):
             return None
+        ordinary = asked.at.ordinary
         ends = self.rounding.ends(self.reference.model, asked.at, asked.participant.runtime)
-        bounds = self._rounding_bounds(asked.at, asked.participant, sure=True)
+        bounds = self._rounding_bounds(asked.at, asked.participant, sure=not ordinary)
         expected = self._comparable(asked.expected)
         names = [n for n in (ends[0] if ends else ()) if n in expected and expected[n].shape == ends[0][n].shape]
         hulls = {n: hull([end[n] for end in ends], expected[n], bounds.get(n, 0.0)) for n in names}
         if not any(each.open.any() for each in hulls.values()):
             return None
-        return self._compare(asked.name, asked.expected, asked.got, asked.participant, bounds, hulls)
+        return self._compare(asked.name, asked.expected, asked.got, asked.participant, bounds, hulls, ordinary=ordinary)
 
     def _fed_at(self, step: int) -> Feeds:
         """What the reference was fed at a step of the rollout."""
@@ -292,14 +292,14 @@ class Trial:
         participant: Participant,
         rounding: Feeds | None = None,
         hulls: Hulls | None = None,
+        *,
+        ordinary: bool = False,
     ) -> Difference:
         reference, candidate = self._comparable({name: expected[name]})[name], self._comparable({name: got})[name]
-        free = self._open_choices(name, expected, got, participant, rounding or {}, hulls or {})
+        open_hulls = {} if ordinary else hulls or {}
+        free = self._open_choices(name, expected, got, participant, rounding or {}, open_hulls)
         if hulls and name in hulls and got.dtype.kind == "f" and got.shape == reference.shape:
-            numbers = np.isfinite(candidate), np.isfinite(reference)
-            none = hulls[name].nan & ~(numbers[0] | numbers[1])
-            one = hulls[name].nan & (numbers[0] ^ numbers[1])
-            free = [*free, (NOT_FROM_ZERO, hulls[name].holds(candidate) | none), (NAN_FROM_ZERO, one)]
+            free = [*free, *hulls[name].forgive(candidate, reference, ordinary=ordinary)]
         return compare(
             reference,
             candidate,
