@@ -26,7 +26,7 @@ from export_model.converters.runtimes.agents import (
     fields_with_size,
 )
 from export_model.exporter.verify.checks.generators import DEPENDENT, likely, wrong_classes
-from export_model.exporter.verify.checks.numbers import rank
+from export_model.exporter.verify.checks.numbers import rank, sum_differences
 from export_model.exporter.verify.difference import Difference, wrong
 from export_model.exporter.verify.findings import Acting, Bisection, Draws, Finding
 from export_model.exporter.verify.participants import Feeds, Participant
@@ -220,6 +220,7 @@ class _Played:
             found = trial.differences(name, expected, got, participant, [s.case for s in steps])
             difference, step = max(zip(found, steps, strict=True), key=lambda pair: rank(pair[0]))
             begins = trial.bisect(participant, name, difference, step.case.feeds)
+            difference = sum_differences(difference, found)
             yield trial.finding(Acting, participant, name, difference, step.case.name, bisection=begins)
 
     def noise(self) -> Iterator[Finding]:

@@ -33,6 +33,7 @@ from export_model.exporter.verify.checks.numbers import numbers, rank
 from export_model.exporter.verify.checks.rollout import rollout
 from export_model.exporter.verify.cut import CutArtefact, cut_artefacts
 from export_model.exporter.verify.difference import Difference, wrong
+from export_model.exporter.verify.excuses import add_forgiven
 from export_model.exporter.verify.findings import Bisection, Draws, Finding, Numbers
 from export_model.exporter.verify.participants import Feeds, Participant
 from export_model.exporter.verify.trial import Cut, Trial
@@ -120,10 +121,11 @@ def _findings_of(trial: Trial, cut: Cut, way: CutArtefact, names: Sequence[str])
 
 
 def _by_output(trial: Trial, cut: Cut, names: Sequence[str], found: Iterator[Finding]) -> list[Finding]:
-    """One finding for each output, that of the odds that it is drawn from where that is the worse."""
+    """One finding for each output, that of the odds that it is drawn from where that is the worse; all that forgave."""
     behind = {s.odds.name: s.name for s in cut.policy.samplers if s.odds is not None}
     odds = {name: cut.policy.actions[sampler] for name, sampler in behind.items()}
     worst: dict[str, Finding] = {}
+    every: dict[str, list[Finding]] = {}
     for finding in found:
         for output in [n for n in odds.get(finding.output, [finding.output])[:1] if n in names]:
             if finding.output in odds and not finding.passed:
@@ -132,10 +134,16 @@ def _by_output(trial: Trial, cut: Cut, names: Sequence[str], found: Iterator[Fin
                 reason = finding.reason or ODDS.format(finding.max_abs_diff)
                 finding = replace(finding, reason=reason, bisection=found_at)
             finding = replace(finding, output=output)
+            every.setdefault(output, []).append(finding)
             before = worst.get(output)
             if before is None or (before.passed, -before.share) > (finding.passed, -finding.share):
                 worst[output] = finding
-    return list(worst.values())
+    return [
+        replace(
+            f, forgiven=add_forgiven(e.forgiven for e in every[name]), elements=sum(e.elements for e in every[name])
+        )
+        for name, f in worst.items()
+    ]
 
 
 def _sampler_findings(trial: Trial, cut: Cut, way: CutArtefact, names: Sequence[str]) -> Iterator[Finding]:

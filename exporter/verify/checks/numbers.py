@@ -130,14 +130,15 @@ def check_recording(trial: Trial) -> Iterator[Finding]:
     noisy = trial.tested.graph.descendants(golden.noiseless)
     names = [n for n in names if n not in noisy]
     participant = reference.participant("golden", names, runtime=reference.runtime)
-    worst: dict[str, tuple[Difference, str]] = {}
+    every: dict[str, list[tuple[Difference, str]]] = {}
     answers = trial.expected[len(trial.cases) - len(golden.cases) :]
     for case, expected, arrays in zip(golden.cases, answers, golden.answers, strict=True):
         for name in (n for n in arrays if n in names and n in expected):
             found = trial.difference(name, expected, arrays[name], participant)
-            if name not in worst or rank(found) > rank(worst[name][0]):
-                worst[name] = (found, case.name)
-    for name, (difference, where) in worst.items():
+            every.setdefault(name, []).append((found, case.name))
+    for name, pairs in every.items():
+        worst, where = max(pairs, key=lambda pair: rank(pair[0]))
+        difference = sum_differences(worst, [found for found, _ in pairs])
         yield trial.finding(Numbers, participant, name, difference, where)
 
 
