@@ -115,6 +115,7 @@ def counted(found: Sequence[Outcome], command: str) -> dict[str, Any]:
         "cells": cells,
         "missed": [asdict(o) for o in found if o.verdict == "missed"],
         "without_effect": sum(o.verdict == "no effect" for o in found),
+        "small": [f"{o.member}: {o.kind} at {o.tensor}" for o in found if o.verdict == "too small to be seen"],
         "alarms": [str(o) for o in found if o.kind == "no fault" and o.verdict != "passed"],
     }
 
@@ -143,7 +144,10 @@ def main() -> int:
         count = options.faults or (None if sound else SAMPLED)
         for outcome in outcomes(given, pool, count=count, every=options.every, sound=sound, ways=ways):
             found.append(outcome)
-            if outcome.verdict in ("missed", "no effect") or (outcome.kind, outcome.verdict) == ("no fault", "caught"):
+            if outcome.verdict in ("missed", "no effect", "too small to be seen") or (
+                outcome.kind,
+                outcome.verdict,
+            ) == ("no fault", "caught"):
                 print(outcome, flush=True)
     words = [a for a in sys.argv[1:] if a != "--write"]
     content = counted(found, " ".join(["python -m tests.faults", *words]))
@@ -155,8 +159,8 @@ def main() -> int:
     caught, located, planted = totals(content)
     print(
         f"{planted} faults in {content['policies']} policies: {caught} caught, {located} located, "
-        f"{planted - caught} missed; {content['without_effect']} more change nothing; "
-        f"{len(content['alarms'])} alarms without a fault"
+        f"{planted - caught} missed; {content['without_effect']} more change nothing, {len(content['small'])} too "
+        f"little to be seen; {len(content['alarms'])} alarms without a fault"
     )
     return 1 if content["missed"] or content["alarms"] else 0
 

@@ -11,12 +11,13 @@ from unittest import mock
 import numpy as np
 from msgspec.structs import replace
 
+from export_model.converters.compiler.options import CompileOptions
 from export_model.converters.consumers.named_files import answered_outputs
 from export_model.converters.files.chunks import Pieces
 from export_model.converters.formats.format import Artifact, Format, WriteOptions
 from export_model.converters.formats.registry import WRITTEN
 from export_model.converters.graph.nodes import node_of
-from export_model.converters.graph.ops.samplers import reseed
+from export_model.converters.graph.ops.samplers import SAMPLERS, reseed
 from export_model.converters.graph.run import run_graph
 from export_model.converters.policy.policy import Policy
 from export_model.converters.runtimes.pool import RuntimePool
@@ -53,7 +54,7 @@ class Fault:
 class Outcome:
     """What came of a fault, whether its place was named, and in which words.
 
-    ``verdict``: caught, missed, no effect, cannot be written; of a policy without one, passed or caught.
+    ``verdict``: caught, missed, no effect, too small to be seen, cannot be written; without a fault passed or caught.
     """
 
     family: str
@@ -82,7 +83,9 @@ class Subject:
     def __post_init__(self) -> None:
         self.source = self.member.source(self.folder)
         self._exporters = {v: Exporter(self.member.options(self.folder / "out", verified=v)) for v in (True, False)}
-        (self.job, *_) = self._exporters[True].compile_source(self.source, Names(), lambda text: None)
+        (self.job, *others) = self._exporters[True].compile_source(self.source, Names(), lambda text: None)
+        brain = self.job.policy.name.rpartition("-")[2] if others else None
+        self._reading = replace(self.member.more.get("compile", CompileOptions()), brain=brain)
 
     def faults(self) -> Iterator[Fault]:
         """Every fault that it can have; of a graph, a function that makes it, so that few are made."""
@@ -117,16 +120,15 @@ class Subject:
         if report.passed is False:
             outcome.located = fault is not None and self._is_located(report, fault)
             outcome.says = "; ".join(dict.fromkeys(f"{f.kind} {f.output}" for f in report.failures))
-        elif fault is not None and fault.policy is not None and not self._matters(fault.policy):
-            outcome.verdict = "no effect"
+        elif fault is not None and fault.policy is not None and (none := self._unseen(fault.policy)):
+            outcome.verdict = none
         else:
             outcome.verdict, outcome.says = "passed" if fault is None else "missed", report.verdict
         return outcome
 
     def ways(self) -> Sequence[str]:
-        """How it can be judged: source code is compared with no source, and names for a consumer are not its."""
-        plain = "profile" not in self.member.more and not WRITTEN[self.member.form].program
-        return WAYS if plain and self.member.form != "nn" and not self.member.more else WAYS[:2]
+        """How it can be judged: what a baked action is beside its source's is no question for ``compare``."""
+        return WAYS[:2] if "bake" in self.member.more else WAYS
 
     def _report(self, fault: Fault | None, way: str) -> ParityReport:
         exporter = self._exporters[way == "export"]
@@ -141,7 +143,10 @@ class Subject:
                     result.folder, source=self.source, runtimes=judges, options=VerifyOptions(), allow_unverified=True
                 )
         file = result.folder / WRITTEN[self.member.form].main_of(result.policy.name)
-        options = CompareOptions(judging=VerifyOptions(runtimes=judges), read=self.member.read, allow_unverified=True)
+        judging = VerifyOptions(runtimes=judges)
+        options = CompareOptions(
+            judging=judging, understanding=self._reading, read=self.member.read, allow_unverified=True
+        )
         return compare_artefacts(self.source, [file], options, pool=self.pool)
 
     def _is_located(self, report: ParityReport, fault: Fault) -> bool:
@@ -160,26 +165,48 @@ class Subject:
             for f in report.failures
         )
 
-    def _matters(self, other: Policy) -> bool:
-        """Whether any number beyond the tolerance, or any decision, is another on inputs of the policy's own."""
-        signature = self.job.policy.signature
-        names = [n.name for n in self.job.policy.graph.nodes if n.op == "Multinomial"]
-        fetches = list(self.job.policy.fetches.values())
-        cases = draw_typical(signature, seed=99, count=max(1, ROWS // 259))
-        rng = np.random.default_rng(0)
-        for number, case in enumerate(cases):
-            feeds = dict(case.feeds)
+    def _unseen(self, other: Policy) -> str:
+        """Why a fault need not be seen; empty where it must be.
+
+        No number beyond the tolerance and no decision is another on inputs of the policy's own; or, in a file that is
+        not cut, only draws of classes are, by less than docs/agreement.md says is seen.
+        """
+        policy, signature = self.job.policy, self.job.policy.signature
+        draws = [n.name for n in policy.graph.nodes if n.op == "Multinomial"]
+        fetches = [*policy.fetches.values(), *draws]
+        drawn = policy.graph.descendants([n.name for n in policy.graph.nodes if n.op in SAMPLERS])
+        changed, shares = set[str](), dict[str, list[tuple[np.ndarray, np.ndarray]]]()
+        for number, case in enumerate(draw_typical(signature, seed=99, count=max(1, ROWS // 259))):
+            feeds, rng = dict(case.feeds), np.random.default_rng(number)
             for spec in signature.inputs:
                 if spec.role is Role.MASKS and number % 2:
                     feeds[spec.name] = _some_forbidden(rng, feeds[spec.name], signature.branches)
-            fed = {self.job.policy.feeds[n]: a for n, a in feeds.items() if n in self.job.policy.feeds}
+            fed = {policy.feeds[n]: a for n, a in feeds.items() if n in policy.feeds}
             made = []
-            for policy in (self.job.policy, other):
+            for each in (policy, other):
                 reseed(number)
-                made.append(run_graph(policy.graph, fed, [*fetches, *names]))
-            if any(_differ(made[0][n], made[1][n]) for n in made[0]):
-                return True
-        return False
+                odds = {n: each.graph[n].inputs[0] for n in draws}
+                found = run_graph(each.graph, fed, [*fetches, *odds.values()])
+                made.append(found | {f"odds of {n}": _softmax(found[o]) for n, o in odds.items()})
+            changed |= {n for n in fetches if _differ(made[0][n], made[1][n])}
+            for name in draws:
+                shares.setdefault(name, []).append((made[0][f"odds of {name}"], made[1][f"odds of {name}"]))
+        if not changed:
+            return "no effect"
+        apart = WRITTEN[self.member.form].program and all(node_of(n) in drawn for n in changed)
+        return "too small to be seen" if apart and draws and not any(map(_is_seen, shares.values())) else ""
+
+
+def _softmax(scores: np.ndarray) -> np.ndarray:
+    wide = np.exp(scores.astype(np.float64) - scores.max(axis=-1, keepdims=True))
+    return np.asarray(wide / wide.sum(axis=-1, keepdims=True))
+
+
+def _is_seen(odds: Sequence[tuple[np.ndarray, np.ndarray]]) -> bool:
+    """Whether a class's share is off by what is stated: 0.04 of one half, and as many deviations of any other."""
+    one, other = (np.concatenate(each) for each in zip(*odds, strict=True))
+    share = one.mean(axis=0)
+    return bool((np.abs(one - other).mean(axis=0) > 0.08 * np.sqrt(share * (1 - share))).any())
 
 
 def _some_forbidden(rng: np.random.Generator, masks: np.ndarray, branches: Sequence[int]) -> np.ndarray:

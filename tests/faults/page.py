@@ -21,8 +21,9 @@ def section(counted: Mapping[str, Any]) -> list[str]:
         "## Planted faults",
         "",
         f"Planted on {counted['date']} by `{counted['command']}` into {counted['policies']} policies, judged by "
-        f"`export`, `verify --source` and `compare` in turn; {counted['without_effect']} more change nothing at 4,096 "
-        "of the policy's own inputs. *Located*: its tensor or function is named.",
+        f"`export`, `verify --source` and `compare` in turn. {counted['without_effect']} more change nothing at 4,096 "
+        f"of the policy's own inputs, {len(counted['small'])} move odds in source code by less than agreement.md says "
+        "is seen. *Located*: the tensor or function is named.",
         "",
         "| family | caught | located | missed |",
         "|---|---|---|---|",
