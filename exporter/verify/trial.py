@@ -220,11 +220,10 @@ class Trial:
         moved = partial(self.rounding.scores, participant.runtime, runnable(self.tested.graph), asked.at)
         others = self.choices.others(name, feeds, self._choice_tolerance(name, participant), moved)
         made = broken_ties(expected[name], others, asked.got, self.tolerance(name, participant))
-        if made is None:
+        if made is None or not (turned := made != expected[name]).any():
             return None
         bounds = self._rounding_bounds(asked.at, participant)
         other = self._compare(name, {**expected, name: made}, asked.got, participant, bounds)
-        turned = made != expected[name]
         most = float(np.abs(made - expected[name])[turned].max()) if made.dtype.kind == "f" else np.inf
         return replace(other, forgiven=(Forgiven(TIE, int(turned.sum()), most), *other.forgiven))
 

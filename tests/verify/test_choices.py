@@ -76,3 +76,27 @@ def test_choices_stand_behind_what_hangs_on_them() -> None:
     nothing = {"state": np.full((2, 3), np.nan, np.float32)}
     assert Choices(graph).has_only_nan_scores("action", nothing)
     assert not Choices(graph).has_only_nan_scores("action", {"state": np.ones((2, 3), np.float32)})
+
+
+def test_a_choice_whose_rival_gives_the_same_numbers_is_no_tie(tmp_path: Path) -> None:
+    """Both classes that are as good look up one number: an answer that is off in another way stays off."""
+    matrix = np.random.default_rng(0).standard_normal((3, 4)).astype(np.float32)
+    matrix[:, 2] = matrix[:, 1]
+    policy = compiled(
+        [
+            placeholder("vector_observation"),
+            constant("w", matrix),
+            node("scores", "MatMul", "vector_observation", "w", transpose_a=False, transpose_b=False, **F),
+            constant("axis", 1, np.int32),
+            node("best", "ArgMax", "scores", "axis", T=np.float32, Tidx=np.int32, output_type=np.int64),
+            constant("looks", np.array([[-1.0], [0.5], [0.5], [1]], np.float32)),
+            constant("rows", 0, np.int32),
+            node("action", "GatherV2", "looks", "best", "rows", Tparams=np.float32, Tindices=np.int64, Taxis=np.int32),
+        ]
+    )
+
+    def lies(feeds: Feeds, a: Array) -> Array:
+        return np.where(np.arange(len(a))[:, None] % 2, a * np.float32(1 + 2e-7), a + 0.1).astype(np.float32)
+
+    lying = spoiling("action", lies)
+    assert wrong(judge(policy, tmp_path, lying, checks=(numbers,))) == {("numbers", "action")}
