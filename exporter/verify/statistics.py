@@ -45,13 +45,20 @@ def chi_square_survival(statistic: float, freedom: int) -> float:
     return scale * h
 
 
+def odds_of(scores: np.ndarray) -> np.ndarray:
+    """The probabilities, float64, that log-probabilities or any scores [..., classes] stand for."""
+    wide = scores.astype(np.float64)
+    with np.errstate(invalid="ignore"):  # of all that are -infinity the odds are NaN
+        odds = np.exp(wide - wide.max(axis=-1, keepdims=True))
+    return np.asarray(odds / odds.sum(axis=-1, keepdims=True))
+
+
 def fit(draws: np.ndarray, log_probs: np.ndarray) -> float:
     """The p-value of ``draws`` (class numbers) under ``log_probs`` (one row); 0 for an impossible class.
 
     A class is impossible below 1e-9: ML-Agents leaves masked actions about 1e-10.
     """
-    probabilities = np.exp(log_probs.astype(np.float64))
-    probabilities /= probabilities.sum()
+    probabilities = odds_of(log_probs)
     if draws.size == 0 or draws.min() < 0 or draws.max() >= probabilities.size:
         return 0.0
     counts = np.bincount(draws.reshape(-1).astype(int), minlength=probabilities.size)
@@ -83,8 +90,7 @@ def fit_all(draws: np.ndarray, log_probs: np.ndarray) -> float:
     """
     if draws.size == 0 or draws.min() < 0 or draws.max() >= log_probs.shape[1]:
         return 0.0
-    probabilities = np.exp(log_probs.astype(np.float64))
-    probabilities /= probabilities.sum(axis=1, keepdims=True) * len(probabilities)
+    probabilities = odds_of(log_probs) / len(log_probs)
     indices = draws.astype(int)
     flat = probabilities.reshape(-1)
     order = np.argsort(flat, kind="stable")

@@ -17,6 +17,7 @@ from export_model.exporter.verify.statistics import (
     columns_related,
     dependent,
     fit_all,
+    odds_of,
     spread_fit,
     uniform_fit,
 )
@@ -84,7 +85,7 @@ def _shares(sampler: Sampler, drawn: np.ndarray, log_probs: np.ndarray | None, l
     rows = drawn.reshape(len(drawn), -1)[:, :_COLUMNS].astype(np.float64)
     if log_probs is None:
         return _BELOW[sampler.kind]((rows - sampler.mean) / sampler.scale)
-    probs = _probabilities(log_probs)
+    probs = odds_of(log_probs)
     classes = np.clip(rows.astype(int), 0, probs.shape[1] - 1)
     mine = np.take_along_axis(probs, classes, axis=1)
     above = np.take_along_axis(np.cumsum(probs, axis=1), classes, axis=1)
@@ -97,12 +98,14 @@ def _alone(
     if not np.isfinite(drawn).all():
         return wrong("NaN or infinity was drawn")
     odds = log_probs.get(sampler.tensor)
+    if odds is not None and np.isnan(odds_of(odds)).any():
+        return wrong("the scores that its classes are drawn from are NaN")
     p_values = [fits(column) for column in shares.T for fits in (uniform_fit, spread_fit)]
     if odds is not None:
         classes = drawn.reshape(len(drawn), -1).astype(int)
         if (classes < 0).any() or (classes >= odds.shape[1]).any():
             return wrong("a class outside of its branch was drawn")
-        if (np.take_along_axis(_probabilities(odds), classes, axis=1) < _NEVER).any():
+        if (np.take_along_axis(odds_of(odds), classes, axis=1) < _NEVER).any():
             return wrong("a class was drawn that never should be")
         p_values += [fit_all(classes, odds)]
     difference = likely(min(1.0, min(p_values) * len(p_values)))
@@ -121,11 +124,6 @@ def likely(p_value: float) -> Difference:
     return Difference(1 - p_value, 1 - p_value, False, reason)
 
 
-def _probabilities(log_probs: np.ndarray) -> np.ndarray:
-    probs = np.exp(log_probs.astype(np.float64))
-    return np.asarray(probs / probs.sum(axis=1, keepdims=True))
-
-
 def _normal(x: np.ndarray) -> np.ndarray:
     return np.asarray((1 + _erf(x / math.sqrt(2))) / 2, np.float64)
 
@@ -138,7 +136,7 @@ def seen_by(participant: Participant, log_probs: np.ndarray) -> np.ndarray:
 
 def with_zeros(log_probs: np.ndarray, rate: float) -> np.ndarray:
     """Log-probabilities [rows, classes] of a sampler whose uniform number is 0 at this rate."""
-    probs = np.exp(log_probs.astype(np.float64)) * (1 - rate)
+    probs = odds_of(log_probs) * (1 - rate)
     probs[np.arange(len(probs)), np.argmax(probs > 0, axis=1)] += rate
     with np.errstate(divide="ignore"):
         return np.log(probs)
