@@ -33,6 +33,7 @@ def made_again(found: Source, contract: Contract, wanted: Profile) -> Job:
     for model, own in _candidates(found, contract):
         dressed = wanted.dress(own)
         if _alike(dressed, contract):
+            own = replace(own, name=contract.name)  # as a file may be called
             return Job(found, model, replace(dressed, name=contract.name), wanted, own)
     raise _not_like_its_source(found, "leave --source out, or export it again")
 

@@ -38,6 +38,14 @@ def test_a_bundle_that_was_made_for_a_consumer_is_held_to_its_checkers(
         assert report.passed is not False
 
 
+def test_it_is_held_against_a_source_whose_name_is_none_of_a_file(tmp_path: Path) -> None:
+    source = tmp_path / "owner+repository__policy.bytes"
+    source.write_bytes(fixture("recurrent").read_bytes())
+    (result,) = export_model(source, tmp_path / "out", for_="barracuda-3", verify="numpy")
+    report = verify_bundle(result.folder, source=source, runtimes="numpy", allow_unverified=True)
+    assert report.passed is not False and report.policy == "owner-repository__policy"
+
+
 def test_what_the_consumer_refuses_is_a_finding_in_its_words(tmp_path: Path) -> None:
     (result,) = export_model(fixture("continuous"), tmp_path, to="onnx", verify="none")
     found = list(consumers("unity6", {"onnx": result.folder / "continuous.onnx"}))
