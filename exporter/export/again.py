@@ -259,6 +259,7 @@ def _run(
             code=CodeOptions.of(found.contract.tool),
             runs_elsewhere=given.source is not None and runs_elsewhere(given.source),
             before=again.own if again is not None and again.bake else None,
+            reread=again is not None,
         )
         weights = found.contract.tool.get("weights")
         # What was rounded is held against itself; the source is asked what it decides.

@@ -156,7 +156,7 @@ def contract_of(
 
 def under_test(job: Job, stage: Path, artifacts: Sequence[Artifact], scratch: Path) -> PolicyUnderTest:
     """A policy whose artefacts lie in ``stage``; what else verification needs is put into ``scratch``."""
-    from export_model.exporter.verify.participants import policy_under_test
+    from export_model.exporter.verify.participants import policy_under_test, write_reference
 
     paths = {a.format.key: stage / a.main for a in artifacts}
     return policy_under_test(
@@ -164,6 +164,7 @@ def under_test(job: Job, stage: Path, artifacts: Sequence[Artifact], scratch: Pa
         paths,
         scratch,
         sizes={a.format.key: a.size for a in artifacts},
+        reference=write_reference(job.policy, scratch),
         source=job.model.original if (job.own is None or job.bake) and job.whole is None else None,
         profile=None if job.profile is None else job.profile.name,
         batch=job.batch,
