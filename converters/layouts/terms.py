@@ -83,7 +83,6 @@ TERMS: Mapping[str, LayoutTerm] = {
                 "commands",
                 "command",
                 "velocity_command",
-                "keyboard_velocity_commands",
                 "generated_commands",
                 "cmd",
             ),

@@ -122,7 +122,10 @@ def compare_artefacts(
     notes = [note for m in matched for note in (*m.notes(policy, used), *_interface_notes(policy, m))]
     ran = any(isinstance(m, Candidate) or m.place(used)[0] is None for m in matched)
     report = replace(
-        report, notes=(*report.notes, *notes, *explaining.notes), self_consistent=report.self_consistent and not ran
+        report,
+        notes=(*report.notes, *notes, *explaining.notes),
+        self_consistent=report.self_consistent and not ran,
+        causes=tuple(explaining.causes),
     )
     if report.passed is None and not report.undecided and not (options.allow_unverified or judging.runtimes == "none"):
         raise unverified_error([form for m in matched for form in m.forms], used, known)

@@ -18,6 +18,7 @@ from export_model.exporter.logs.search import Explanation, explain
 from export_model.exporter.logs.trials import Trials
 from export_model.exporter.verify.findings import Finding
 from export_model.exporter.verify.participants import Feeds, Participant, Run
+from export_model.exporter.verify.report import SideCause
 from export_model.exporter.verify.trial import Trial
 from export_model.exporter.verify.verification import CHECKS, Check
 from export_model.exporter.verify.work import products
@@ -69,6 +70,7 @@ class Explaining:
 
     def __init__(self, checks: Sequence[Check] = CHECKS) -> None:
         self.notes: list[str] = []
+        self.causes: list[SideCause] = []
         self._checks = checks
 
     def __call__(self, trial: Trial, participant: Participant) -> Iterator[Finding]:
@@ -77,7 +79,13 @@ class Explaining:
         yield from findings
         heads = _shared_actions(trial, participant)
         if heads and not all(f.passed for f in findings) and products(trial.tested.graph) <= _MOST_PRODUCTS:
-            self.notes += _explanations(trial, participant, heads)
+            for side, other, explanation in _explanations(trial, participant, heads):
+                phrases = ", ".join(_phrases(explanation, side, other))
+                self.notes.append(f"{participant.name}: the {side} is the {other} with {phrases}")
+                self.causes += [
+                    SideCause(participant.name, side, c.kind, c.where, in_sides(c.says, side, other))
+                    for c in explanation.causes
+                ]
 
 
 def _shared_actions(trial: Trial, participant: Participant) -> dict[str, str]:
@@ -91,8 +99,11 @@ def _shared_actions(trial: Trial, participant: Participant) -> dict[str, str]:
     return actions
 
 
-def _explanations(trial: Trial, participant: Participant, heads: Mapping[str, str]) -> Iterator[str]:
-    signature, label = trial.signature, participant.name
+def _explanations(
+    trial: Trial, participant: Participant, heads: Mapping[str, str]
+) -> Iterator[tuple[str, str, Explanation]]:
+    """Yield (the side that is the other with something, the other, with what), once at most."""
+    signature = trial.signature
     pair = signature.recurrence
     if pair is not None and pair[1] not in participant.outputs:
         return
@@ -108,7 +119,7 @@ def _explanations(trial: Trial, participant: Participant, heads: Mapping[str, st
         answered = [s.name for s in signature.outputs] if other == "reference" else participant.outputs
         found = _explain(signature, runs[other], answered, logs[side], heads)
         if found is not None and found.whole:
-            yield f"{label}: the {side} is the {other} with {', '.join(_phrases(found, side, other))}"
+            yield side, other, found
             return
 
 

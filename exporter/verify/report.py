@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from msgspec import Struct, field
-from msgspec.structs import replace
+from msgspec.structs import asdict, replace
 
 from export_model.exporter.tables import count_text
 from export_model.exporter.verify.findings import Accepted, Failure, Finding, Played, Shape, Undecided
@@ -67,6 +67,23 @@ class Pair(Struct, frozen=True):
         return f"{worst.cell()} {worst.output}" + (f"; drawn: {', '.join(drawn)}" if drawn else "")
 
 
+class SideCause(Struct, frozen=True):
+    """What makes one ``side`` of a comparison the other: a cause of the table of ``verify --log``.
+
+    ``format`` is what the report calls the candidate, ``kind`` the row, ``where`` the tensor or column.
+    """
+
+    format: str
+    side: str
+    kind: str
+    where: str
+    says: str
+
+    def to_dict(self) -> dict[str, str]:
+        """Return its entry in ``causes`` of parity.json."""
+        return asdict(self)
+
+
 class ParityReport(Struct, frozen=True):
     """All findings on one policy. ``passed`` is None where no independent runtime ran."""
 
@@ -87,6 +104,8 @@ class ParityReport(Struct, frozen=True):
     original: str | None = None
     #: what the bundle's files earned when they played
     played: tuple[PlayRecord, ...] = ()
+    #: what of a comparison makes one side the other, in the order in which it is applied
+    causes: tuple[SideCause, ...] = ()
 
     def __repr__(self) -> str:
         compared = count_text(len(self.comparisons), "comparison")
@@ -186,4 +205,5 @@ class ParityReport(Struct, frozen=True):
             **({"whole_sizes": dict(self.whole_sizes)} if self.whole_sizes else {}),
             "notes": list(self.notes),
             **({"played": [record.to_dict() for record in self.played]} if self.played else {}),
+            **({"causes": [cause.to_dict() for cause in self.causes]} if self.causes else {}),
         }

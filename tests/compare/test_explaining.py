@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -10,12 +11,15 @@ import onnx
 import pytest
 
 from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.compare import explaining
 from export_model.exporter.compare.explaining import in_sides
 from export_model.exporter.export.pipeline import ExportOptions, export
 from export_model.exporter.logs import causes
+from export_model.exporter.verify import report as report_module
 from fixtures import path as fixture
 from tests.compare.planted import ACTOR, LSTM, PAIRS, Edit, before_input, compared, is_named, other_weights
 from tests.comparing import compare_artefacts
+from tests.reports.validation import check_parity
 
 CONTINUOUS = ACTOR.path
 
@@ -46,6 +50,25 @@ def test_a_difference_is_called_what_it_is(name: str, tmp_path: Path, pool: Runt
     report, named = compared(pair, tmp_path, pool)
     assert report.passed is False
     assert is_named(pair, named) == bool(pair.words), named
+
+
+@pytest.mark.parametrize(("name", "kind"), [("actor: columns", "swap"), ("actor: tanh", "squash")])
+def test_the_cause_is_data_too(name: str, kind: str, tmp_path: Path, pool: RuntimePool) -> None:
+    report, named = compared(PAIRS[name], tmp_path, pool)
+    content = report.to_dict()
+    check_parity(json.dumps(content))
+    (cause,) = content["causes"]
+    assert (cause["kind"], cause["side"]) == (kind, "candidate")
+    assert cause["format"] in {c["format"] for c in content["comparisons"]}
+    assert any(cause["where"] in sentence and cause["says"] in sentence for sentence in named)
+    same = compare_artefacts(ACTOR.path, ACTOR.path, runtimes="onnxruntime", pool=pool)
+    assert "causes" not in same.to_dict()
+
+
+def test_the_schema_has_every_kind_of_cause() -> None:
+    schema = json.loads((Path(report_module.__file__).parents[1] / "reports/parity.schema.json").read_text())
+    kinds = schema["properties"]["causes"]["items"]["properties"]["kind"]["enum"]
+    assert sorted(explaining._CHANGES) == kinds
 
 
 def test_no_sentence_speaks_of_a_log() -> None:
