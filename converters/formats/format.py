@@ -160,7 +160,8 @@ class Code(Struct, frozen=True):
 class Format(Struct, frozen=True, eq=False, kw_only=True):
     """A form in which policies are given, written or both. Unsupported features are None or empty.
 
-    - ``key`` is its one name, ``label`` what people call it, ``advice`` what to do where it cannot be read.
+    - ``key`` is its name, ``aliases`` are words that ``--to`` takes besides, ``label`` is what people call it,
+      ``advice`` what to do where it cannot be read.
     - ``sniff`` looks at a file's content. ``marker`` is the file that makes a folder one of this format; ``at`` says
       whether a path that is no file (a folder, a checkpoint's prefix) stands for one.
     - ``read`` gives the models of a file or folder; ``members`` instead says which sources inside are to be read.
@@ -191,6 +192,7 @@ class Format(Struct, frozen=True, eq=False, kw_only=True):
 
     key: str
     label: str
+    aliases: tuple[str, ...] = ()
     advice: str = ""
     sniff: Callable[[Content], bool] | None = None
     marker: str = ""

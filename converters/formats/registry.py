@@ -44,7 +44,8 @@ FROZEN_GRAPH, SAVED_MODEL, TFJS, ONNX, BARRACUDA, CSHARP, LITERT = (
 
 
 def format_for_writing(key: str) -> Format:
-    """The format of a word of ``--to``. Raises UsageError."""
+    """The format of a word of ``--to``, its key or an alias. Raises UsageError."""
+    key = next((f.key for f in WRITTEN.values() if key in f.aliases), key)
     if key not in WRITTEN:
         raise UsageError(
             f"--to {key}: unknown format",

@@ -11,6 +11,7 @@ import click
 
 from export_model.exporter.cli.console import Console, reporting
 from export_model.exporter.cli.group import command
+from export_model.exporter.cli.guesses import answer_place
 from export_model.exporter.cli.options import RULES, as_given, coding, comparing, located, reading, understanding
 from export_model.exporter.cli.rows import PATH
 from export_model.exporter.cli.terminal import say_lines
@@ -116,6 +117,7 @@ def export_command(
         console.profiles()
         return
     console.check_verified(runtimes)
+    answer_place(sources, out)
     job = ExportOptions(
         out=out,
         targets=None if targets is None else [t for t in targets.split(",") if t],

@@ -84,6 +84,16 @@ class Command(click.Command):
         lines = [f"  {typed:{width}}  {what}".rstrip() for typed, what in examples]
         self.epilog = "\n".join(["\b", "Examples:", *lines]) if lines else None
 
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """The arguments; an option of another tool is answered by what to type here."""
+        try:
+            return super().parse_args(ctx, args)
+        except click.NoSuchOption as error:
+            from export_model.exporter.cli.guesses import answer_option
+
+            answer_option(error)
+            raise
+
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the core options, or all of them by group; an option that is in no group stands under Output."""
         if self.core and not ctx.meta.get(_ALL):
@@ -184,6 +194,9 @@ class SourceGroup(click.Group):
             return
         import difflib
 
+        from export_model.exporter.cli.guesses import answer_word
+
+        answer_word(word)
         close = difflib.get_close_matches(word, self.commands, n=1, cutoff=0.7)
         if close and not Path(word).exists():
             raise UsageError(f"{word!r} is neither a command nor a file", fix=f"did you mean: {PROGRAM} {close[0]}?")

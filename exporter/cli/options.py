@@ -23,6 +23,9 @@ _EXAMPLES = {
     "--set": "speed=0.5",
 }
 
+#: What those want who give such an option a file, as other tools do.
+_PLACES = {"--output": " (where to write is -o DIR)", "--input": " (a file to read needs no option)"}
+
 
 def pairs(values: Sequence[str], flag: str) -> dict[str, str]:
     """NAME=VALUE, given any number of times. Raises UsageError."""
@@ -30,7 +33,8 @@ def pairs(values: Sequence[str], flag: str) -> dict[str, str]:
     for value in values:
         name, equals, rest = value.partition("=")
         if not equals or not name or not rest:
-            raise UsageError(f"{flag} {value}: NAME=VALUE is expected", fix=f"for example {flag} {_EXAMPLES[flag]}")
+            fix = f"for example {flag} {_EXAMPLES[flag]}{_PLACES.get(flag, '')}"
+            raise UsageError(f"{flag} {value}: NAME=VALUE is expected", fix=fix)
         found[name] = rest
     return found
 

@@ -364,11 +364,13 @@ def _check_parity(options: ExportOptions, formats: Sequence[Format]) -> None:
 def _formats(options: ExportOptions, wanted: Profile | None) -> list[Format]:
     """What to write: ``--to``, or what the consumer of ``--for`` loads. Raises UsageError."""
     usual = DEFAULTS if wanted is None else wanted.formats[:1]
-    targets = usual if options.targets is None else tuple(dict.fromkeys(options.targets))
+    asked = [format_for_writing(word) for word in (usual if options.targets is None else options.targets)]
+    formats = list(dict.fromkeys(asked))
     if wanted is None:
-        return [format_for_writing(target) for target in targets]
+        return formats
+    targets = [f.key for f in formats]
     for target in targets:
-        if format_for_writing(target).key not in wanted.formats:
+        if target not in wanted.formats:
             raise UsageError(
                 f"--to {target} does not go with --for {wanted.name}",
                 why=f"{wanted.purpose}: it loads {', '.join(wanted.formats)}",
@@ -390,7 +392,7 @@ def _formats(options: ExportOptions, wanted: Profile | None) -> list[Format]:
                 why=f"the consumer decides the {decided}",
                 fix=f"leave {flag} out",
             )
-    formats, noise = [format_for_writing(target) for target in targets], options.compile.noise
+    noise = options.compile.noise
     if noise is not None and noise not in wanted.noise and not wanted.own_names.issuperset(targets):
         raise UsageError(
             f"--noise {noise} does not go with --for {wanted.name}",

@@ -37,7 +37,7 @@ def out(tmp_path: Path) -> Iterator[Path]:
     ("flags", "words"),
     [
         (["--to", "onx"], ["--to onx", "did you mean onnx?"]),
-        (["--to", "saved-model"], ["did you mean saved_model?"]),
+        (["--to", "saved-mdel"], ["did you mean saved_model?"]),
         (["--to", "coreml"], ["--to coreml", "the formats are bytes, saved_model, tfjs, onnx"]),
         (["--to", "bytes,onnx,coreml"], ["--to coreml"]),
         (["--to", ""], ["--to names no format", "bytes, saved_model, tfjs, onnx"]),

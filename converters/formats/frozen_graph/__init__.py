@@ -16,6 +16,7 @@ else:
 FORMATS = (
     Format(
         key="bytes",
+        aliases=("pb", "frozen_graph"),
         label="a TensorFlow graph (GraphDef)",
         sniff=lambda file: file.is_graph,
         read=_source.read,

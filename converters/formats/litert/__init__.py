@@ -24,6 +24,7 @@ $play"""
 FORMATS = (
     Format(
         key="litert",
+        aliases=("tflite",),
         label="a LiteRT (TensorFlow Lite) model",
         sniff=lambda file: file.head[4:8] == b"TFL3",
         read=_source.read,

@@ -26,6 +26,7 @@ def _sniff(file: Content) -> bool:
 FORMATS = (
     Format(
         key="saved_model",
+        aliases=("saved-model", "savedmodel"),
         label="a SavedModel",
         sniff=_sniff,
         marker="saved_model.pb",
