@@ -220,3 +220,9 @@ def size_of(path: Path) -> int:
     """The bytes of a file, or of all in a folder; 0 where nothing is."""
     files = path.rglob("*") if path.is_dir() else [path]
     return sum(f.stat().st_size for f in files if f.is_file())
+
+
+def natural_order(path: Path) -> list[list[str | int]]:
+    """Sort key of paths in the order that people expect: m2 before m10."""
+    parts = (re.split("([0-9]+)", part) for part in path.parts)
+    return [[int(word) if i % 2 else word for i, word in enumerate(words)] for words in parts]

@@ -12,7 +12,7 @@ import click
 from msgspec import Struct
 
 from export_model.exporter.cli.rows import FILE
-from export_model.exporter.cli.terminal import Bar, Progress, say, say_json, say_lines, say_paragraph
+from export_model.exporter.cli.terminal import Bar, Progress, say, say_json, say_lines, say_next, say_paragraph
 from export_model.signatures.errors import ExportModelError, UsageError
 
 if TYPE_CHECKING:
@@ -250,17 +250,17 @@ class Console(Struct, frozen=True):
             return
         failed = next((r for r in results if r.passed is False), None)
         if failed is not None:
-            say(f"next: read {failed.folder}/parity.json; the bundle was kept apart because its formats disagree")
+            say_next(f"read {failed.folder}/parity.json; the bundle was kept apart because its formats disagree")
             return
         if profile is not None:
             for line in _next_for(results, profile, sources):
-                say(f"next: {line}")
+                say_next(line)
             return
         ours = results[-1].policy.signature.family.startswith("ML-Agents")
         if ours and names != "source" and _can_be_dressed(results[-1].sizes):
             say_paragraph("note: Unity looks up other names: export with --for unity6 (--for help: the others)")
         for line in _next(results, sources):
-            say(f"next: {line}")
+            say_next(line)
 
     def json(self, content: Mapping[str, Any]) -> None:
         """The answer for a program, where it was asked for."""
@@ -306,7 +306,7 @@ def _to_verify(results: Sequence[ExportResult], sources: Sequence[Path]) -> list
 def _next_for(results: Sequence[ExportResult], profile: str, sources: Sequence[Path]) -> list[str]:
     """What to do with the files for a consumer, and where each policy's settings are told."""
     from export_model.converters.consumers.profiles import profile as known
-    from export_model.exporter.tables import command_text
+    from export_model.exporter.tables import command_text, hint
 
     wanted = known(profile)
     *rest, last = (f"{_files(r)} of {r.folder}" for r in results)
@@ -314,7 +314,7 @@ def _next_for(results: Sequence[ExportResult], profile: str, sources: Sequence[P
     place = f"give {files} to {' and '.join(wanted.loaders)}"
     if not wanted.loaders:
         place = f"put {files} into a project of {wanted.purpose}"
-    settings = [f"{command_text('snippets', r.folder, '--for', wanted.name)}    (what to set there)" for r in results]
+    settings = [hint(command_text("snippets", r.folder, "--for", wanted.name), "what to set there") for r in results]
     return [*_to_verify(results, sources), place, *settings]
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from export_model.exporter.cli.terminal import say, say_json, say_lines
+from export_model.exporter.cli.terminal import say, say_json, say_lines, say_next
 from export_model.signatures.errors import UsageError
 
 
@@ -37,7 +37,7 @@ def consumers_command(importer: str | None, as_json: bool) -> None:
         rows = [[i["name"], i["release"], profiles[i["name"]], str(counts[i["name"]])] for i in tables["importers"]]
         say_lines(table(("importer", "of", "--for", "misreadings"), rows))
         say()
-        say("next: export-model consumers 'Barracuda 2.0.0', or --json for everything")
+        say_next("export-model consumers 'Barracuda 2.0.0', or --json for everything")
         return
     mine = [r for r in tables["readings"] if r["importer"] == importer]
     cells = [[", ".join(r["ops"]), r["reading"], r["construct"], r["evidence"]] for r in mine]

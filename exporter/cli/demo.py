@@ -12,7 +12,7 @@ from export_model.exporter.cli.export import export_command
 from export_model.exporter.cli.group import PROGRAM, command
 from export_model.exporter.cli.rows import PATH
 from export_model.exporter.cli.serve import serve_command
-from export_model.exporter.cli.terminal import say
+from export_model.exporter.cli.terminal import say, say_next
 
 
 @command(
@@ -44,7 +44,7 @@ def _write_files(out: Path) -> None:
     width = max(map(len, FILES))
     for name, what in FILES.items():
         say(f"{out / name!s:{width + len(str(out / 'x')) - 1}}  {what}".rstrip())
-    say(f"next: {command_text(out / '3DBall.onnx', '-o', out / 'exported')}")
+    say_next(command_text(out / "3DBall.onnx", "-o", out / "exported"))
 
 
 def _demonstrate(out: Path, no_open: bool) -> None:

@@ -13,7 +13,7 @@ from export_model.exporter.cli.export import export_command
 from export_model.exporter.cli.group import command
 from export_model.exporter.cli.options import as_given, reading, understanding
 from export_model.exporter.cli.rows import FILE, PATH
-from export_model.exporter.cli.terminal import say, say_json, say_lines
+from export_model.exporter.cli.terminal import say, say_json, say_lines, say_next
 from export_model.signatures.errors import ExportModelError, UsageError
 
 if TYPE_CHECKING:
@@ -121,7 +121,7 @@ def _end(status: int, sources: Sequence[Path]) -> None:
     if status:
         sys.exit(status)
     if sources:
-        _say_next(sources)
+        _propose_export(sources)
 
 
 def _check_alone(logdir: Path | None, svg: Path | None) -> None:
@@ -130,12 +130,12 @@ def _check_alone(logdir: Path | None, svg: Path | None) -> None:
         raise UsageError("--logdir and --svg are for one source", fix="name one")
 
 
-def _say_next(sources: Sequence[Path]) -> None:
+def _propose_export(sources: Sequence[Path]) -> None:
     from export_model.converters.files.fetch import path_text
     from export_model.exporter.tables import command_text
 
     both = as_given({p.name for p in export_command.params if p.name is not None} - {"as_json"})
-    say(f"next: {command_text(*map(path_text, sources), *both, '-o', 'exported')}")
+    say_next(command_text(*map(path_text, sources), *both, "-o", "exported"))
 
 
 def _check_looked_at(given: Mapping[str, bool]) -> None:

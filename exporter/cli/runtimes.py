@@ -17,7 +17,14 @@ _SAID = {
 }
 
 
-@click.group("runtimes", invoke_without_command=True, short_help="List the runtimes, and how to install the others.")
+@click.group(
+    "runtimes",
+    invoke_without_command=True,
+    subcommand_metavar="[install NAME]",
+    short_help="List the runtimes, and how to install the others.",
+    epilog="\b\nExamples:\n  export-model runtimes               what is here\n"
+    "  export-model runtimes install tfjs  TensorFlow.js in Node and in a browser",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 @click.pass_context
 def runtimes_command(ctx: click.Context, as_json: bool) -> None:
@@ -46,10 +53,10 @@ def runtimes_command(ctx: click.Context, as_json: bool) -> None:
         say_paragraph(", ".join(lacking), "not on this system: ")
 
 
-@runtimes_command.command("install")
+@runtimes_command.command("install", short_help="Install tfjs, onnxruntime-web, litert-web or tf1.")
 @click.argument("name")
 def install_command(name: str) -> None:
-    """Install a runtime into the user's cache folder; "tfjs" and "tf1" stand for all whose names begin so."""
+    """Install tfjs, onnxruntime-web, litert-web or tf1 into the user's cache folder; pip installs the others."""
     from export_model.converters.runtimes.registry import RUNTIMES
 
     chosen = [r for r in RUNTIMES if r.name == name]

@@ -11,7 +11,7 @@ import click
 from export_model.exporter.cli.group import command
 from export_model.exporter.cli.options import one_bundle
 from export_model.exporter.cli.rows import PATH
-from export_model.exporter.cli.terminal import say
+from export_model.exporter.cli.terminal import say, say_next
 from export_model.signatures.errors import UsageError
 
 _SCENES = ("auto", "ball3d", "crawler2d", "gridworld", "hallway", "tennis", "none")
@@ -53,14 +53,14 @@ def serve_command(bundle: Path, host: str, port: int, opens: bool, out: Path | N
             page = assemble_one_file(folder, scene)
         write_file(page, out)
         say(f"wrote {out}: one file, {len(page) / 1e3:.0f} kB, which needs no server and no network")
-        say(f"next: open {out} in a browser, or send it to somebody")
+        say_next(f"open {out} in a browser, or send it to somebody")
         return
     with _bundle_of(bundle) as folder:
         site = assemble(folder, scene)
     if out is not None:
         write_site(site, out)
         say(f"wrote {out}: {len(site)} files, {sum(map(len, site.values())) / 1e6:.1f} MB")
-        say(f"next: host it anywhere, or: python -m http.server --directory {out}")
+        say_next(f"host it anywhere, or: python -m http.server --directory {out}")
         return
     _serve(site, host, port, opens)
 
@@ -102,7 +102,7 @@ def _gallery(folders: Sequence[Path], out: Path | None, scene: str, host: str, p
     write_site(gallery.files, out)
     size = sum(map(len, gallery.files.values()))
     say(f"wrote {out}: {count_text(len(gallery.shown), 'page')} and an index, {size / 1e6:.1f} MB")
-    say(f"next: host it anywhere, or: python -m http.server --directory {out}")
+    say_next(f"host it anywhere, or: python -m http.server --directory {out}")
 
 
 @contextmanager

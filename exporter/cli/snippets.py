@@ -9,7 +9,7 @@ import click
 from export_model.exporter.cli.group import command
 from export_model.exporter.cli.options import one_bundle
 from export_model.exporter.cli.rows import PATH
-from export_model.exporter.cli.terminal import say, say_json, say_lines
+from export_model.exporter.cli.terminal import say, say_json, say_lines, say_next
 from export_model.signatures.errors import UsageError
 
 
@@ -46,7 +46,7 @@ def snippets_command(bundle: Path | None, target: str | None, as_json: bool) -> 
         rows = [[s.target.name, s.target.title] for s in made]
         rows += [[t.name, f"{t.title}; needs {lacking[t.name]}"] for t in TARGETS if t.name in lacking]
         say_lines(table(("--for", "what"), rows))
-        say(f"next: {command_text('snippets', found.folder, '--for', made[0].target.name)}")
+        say_next(command_text("snippets", found.folder, "--for", made[0].target.name))
         return
     if len(made) == 1:
         say_lines(made[0].code, nl=False)

@@ -25,6 +25,8 @@ _ERASE = "\r\x1b[2K"
 #: What the logs of a CI obey: a line that begins with "::" (GitHub), "##[", "##vso[" (Azure), "##teamcity[".
 _COMMANDS = re.compile(r"^[ \t]*:(?=:)|#(?=#\w*\[)", re.MULTILINE)
 _UNSEEN = "\u200b"
+#: A word of a command, its quotes included.
+_WORD = re.compile(r"""(?:'[^']*'|"[^"]*"|[^\s'"])+""")
 
 
 def say(text: str = "", *, mark: str = "", colour: str | None = None, err: bool = False) -> None:
@@ -43,6 +45,29 @@ def say_paragraph(text: str, first: str = "", rest: str = "  ", *, colour: str |
     from export_model.exporter.tables import paragraph
 
     say_lines(paragraph(text, first, rest), colour=colour)
+
+
+def say_next(step: str) -> None:
+    """Print what to do next."""
+    say_lines(next_text(printable(step)))
+
+
+def next_text(step: str) -> str:
+    """Return ``next:`` and what to do, as wide as the terminal; a command is wrapped so that it can be pasted."""
+    from export_model.exporter.tables import paragraph, room
+
+    width = room()
+    if width is None or len(step) + 6 <= width:
+        return f"next: {step}"
+    if not step.startswith("export-model "):
+        return paragraph(step, "next: ", "      ")
+    lines, line = [], "next:"
+    for word in _WORD.findall(step):
+        if len(line) + len(word) + 3 > width and line.strip() not in ("", "next:"):
+            lines.append(f"{line} \\")
+            line = "     "
+        line += f" {word}"
+    return "\n".join([*lines, line])
 
 
 def _inert(text: str) -> str:

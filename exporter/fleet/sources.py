@@ -13,6 +13,7 @@ from pathlib import Path
 from msgspec import Struct, field
 
 from export_model.converters.files.fetch import Fetched, path_text, unreadable
+from export_model.converters.files.folders import natural_order
 from export_model.converters.formats.bundle import BUNDLE
 from export_model.converters.formats.recognise import recognise_path
 from export_model.converters.formats.source import ReadOptions
@@ -137,7 +138,7 @@ class _Search(Struct, frozen=True):
     def _matching(self, pattern: Path) -> Iterator[Path]:
         """The sources that a pattern finds; of a folder that is a source itself, nothing that lies in it."""
         whole: set[Path] = set()
-        for match in sorted(set(_glob(pattern))):
+        for match in sorted(set(_glob(pattern)), key=natural_order):
             if not whole.isdisjoint(match.parents) or _lies_in(match, self.out):
                 continue
             if match.is_file():
@@ -168,7 +169,7 @@ class _Search(Struct, frozen=True):
                 yield path
                 continue
             try:
-                inside = sorted(path.iterdir(), key=lambda p: p.name, reverse=True)
+                inside = sorted(path.iterdir(), key=natural_order, reverse=True)
             except OSError as error:
                 raise unreadable(path, error) from error
             inside = [p for p in inside if not p.name.startswith(".")]
@@ -256,7 +257,7 @@ def _parts(folder: Path, read: ReadOptions) -> list[Path] | None:
     members = found.members(folder, read)
     paths = [m.path for m in members if m.path.is_file() and m.path.parent == folder and m.path.stem == m.name]
     apart = len(paths) == len(members) and not any((folder / str(m.name)).is_dir() for m in members)
-    return paths if apart else None
+    return sorted(paths, key=natural_order) if apart else None
 
 
 def _is_called_a_model(path: Path) -> bool:

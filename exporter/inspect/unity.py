@@ -31,7 +31,11 @@ def check_for_unity(
     wanted = list(CONSUMERS.values()) if "all" in names else []
     wanted += [consumer(name) for name in names if name != "all"]
     agent = _agent(sensors, actions, brain)
-    return [check_file(path, release, agent) for path in _files(source) for release in dict.fromkeys(wanted)]
+    verdicts = list[UnityVerdict]()
+    for path in _files(source):  # the last first: its profile is what a refused file is to be exported for
+        said = {release: check_file(path, release, agent) for release in reversed(dict.fromkeys(wanted))}
+        verdicts += [said[release] for release in dict.fromkeys(wanted)]
+    return verdicts
 
 
 def all_accept(verdicts: Sequence[UnityVerdict]) -> bool:

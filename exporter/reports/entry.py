@@ -10,10 +10,12 @@ from msgspec import Struct
 
 from export_model.converters.files.fetch import path_text
 from export_model.converters.formats.bundle.bundle import Bundle
+from export_model.converters.formats.registry import WRITTEN
 from export_model.converters.graph.nodes import Graph
 from export_model.exporter.export.pipeline import ExportResult
 from export_model.exporter.markup import Markup
 from export_model.exporter.verify.report import ParityReport
+from export_model.exporter.verify.verdict import NOT_ASKED
 from export_model.signatures.contract import Contract
 from export_model.signatures.errors import ExportModelError
 from export_model.signatures.sampling import draw_cases, draw_rollout
@@ -38,6 +40,15 @@ class Entry(Struct, frozen=True):
     def name(self) -> str:
         """The policy's name."""
         return self.report.policy
+
+    @property
+    def missing(self) -> dict[str, str]:
+        """Runtime → why it did not run: not those that nobody asked for, or that run other formats."""
+        report = self.report
+        others = {r for key, f in WRITTEN.items() if key not in report.sizes for r in f.runtimes}
+        others -= {r for key, f in WRITTEN.items() if key in report.sizes for r in f.runtimes}
+        states = ((n, s["reason"] or "no reason given") for n, s in report.runtimes.items() if s["status"] != "ran")
+        return {n: reason for n, reason in states if reason != NOT_ASKED and not (report.sizes and n in others)}
 
     def feeds(self, case: str) -> Mapping[str, np.ndarray]:
         """The inputs of a case by its name in the report, drawn again from the seed; empty where they are unknown."""

@@ -69,11 +69,7 @@ def _policy(entry: Entry) -> list[str]:
         if c.tolerance.reason
     ]
     lines += _collapsible_section("Tolerances other than the default", list(dict.fromkeys(tolerances)))
-    missing = [
-        f"- {code(name)}: {text(state['reason'] or '')}"
-        for name, state in report.runtimes.items()
-        if state["status"] == "not run"
-    ]
+    missing = [f"- {code(name)}: {text(reason)}" for name, reason in entry.missing.items()]
     lines += _collapsible_section("Runtimes that did not run", missing)
     return lines + _collapsible_section("Notes", [f"- {text(note)}" for note in report.notes])
 

@@ -54,7 +54,7 @@ def page(entries: Sequence[Entry], refused: Sequence[ExportModelError] = ()) -> 
     names = [*map(place_of, refused), *(e.name for e in ordered)]
     alone = len(names) == 1
     eyebrow = el("h1" if alone else "p", "export-model · parity report", class_="eyebrow")
-    title = f"{names[0]}: parity report" if alone else f"Parity report on {len(ordered)} policies"
+    title = f"{names[0]}{_origin(ordered)}: parity report" if alone else f"Parity report on {len(ordered)} policies"
     title += f", {len(refused)} refused" if refused and not alone else ""
     bundled = any(e.contract is not None for e in entries)
     data = " parity.json in the bundle holds the same as data." if bundled else ""
@@ -87,20 +87,20 @@ def _overview(entries: Sequence[Entry], refused: Sequence[ExportModelError]) -> 
     found = [{(p.format, p.runtime): p for p in e.report.pairs} for e in entries]
     pairs = list(dict.fromkeys(pair for rows in found for pair in rows))
     table = [
-        (el("a", place_of(error), href=f"#refused-{n}"), *(_heat(None) for _ in pairs), "–", _REFUSED)
+        (el("a", place_of(error), href=f"#refused-{n}"), _REFUSED, "–", *(_heat(None) for _ in pairs))
         for n, error in enumerate(refused, 1)
     ]
     table += [
         (
             el("a", e.name, href=f"#policy-{n}"),
-            *(_heat(rows.get(pair)) for pair in pairs),
-            f"{len(e.report.failures)} of {len(e.report.comparisons)}",
             _chip(e),
+            f"{len(e.report.failures)} of {len(e.report.comparisons)}",
+            *(_heat(rows.get(pair)) for pair in pairs),
         )
         for n, (e, rows) in enumerate(zip(entries, found, strict=True), 1)
     ]
     two_lines = ([kind, el("br"), runtime] for kind, runtime in pairs)
-    head = ("policy", *two_lines, ["disagree-", el("br"), "ments"], "verdict")
+    head = ("policy", "verdict", ["disagree-", el("br"), "ments"], *two_lines)
     return el(
         "div",
         sections.table(
@@ -148,6 +148,12 @@ def _policy(entry: Entry, number: int, *, alone: bool) -> Markup:
         class_="policy",
         open=failed,
     )
+
+
+def _origin(entries: Sequence[Entry]) -> str:
+    """Return which file the only policy is from, in words; nothing where that is unknown."""
+    found = [Path(e.contract.origin.path).name for e in entries if e.contract is not None]
+    return f" from {found[0]}" if found else ""
 
 
 def _refusal(error: ExportModelError, number: int) -> Markup:

@@ -21,7 +21,11 @@ _SHOWN_VALUES = 12
 #: More boxes than this are no picture any more.
 _MOST_BLOCKS = 90
 _MOST_NODES = 3000
+#: A drift that never takes this share of the tolerance is a sentence, not a chart.
+_SEEN = 0.1
 _MOST_FAILURES = 40
+#: Rows of a table of what was forgiven that stays open.
+_MOST_OPEN = 8
 
 
 def section(title: str, *content: Child) -> Markup:
@@ -89,7 +93,8 @@ def again(entry: Entry) -> Markup | None:
     chosen = ["--runtimes", ",".join(ran)] if ran else ["--allow-unverified"]
     numbers = ["--seed", str(report.seed), "--samples", str(report.samples), "--steps", str(entry.steps)]
     line = command_text(*entry.command, *chosen, *numbers)
-    return el("p", "To compare again: ", el("code", line), class_="soft again")
+    command = el("div", el("code", line), class_="scroll", tabindex=0, role="group", aria_label="To compare again")
+    return el("div", el("p", "To compare again:"), command, class_="soft again")
 
 
 def failures(entry: Entry) -> Markup | None:
@@ -135,7 +140,15 @@ def excuses(entry: Entry) -> Markup | None:
     ]
     head = ("format", "runtime", "output", "rule", "elements", "largest difference")
     caption = "Elements beyond the tolerance that a rule forgave: docs/agreement.md says what each may hide"
-    return section("Forgiven", table(caption, head, rows, (4, 5))) if rows else None
+    return section("Forgiven", _folded(caption, head, rows, (4, 5))) if rows else None
+
+
+def _folded(
+    caption: str, head: Sequence[Child], rows: Sequence[Sequence[Child]], numbers: Sequence[int] = ()
+) -> Markup:
+    """A table that says one thing often: closed where it is long."""
+    whole = table(caption, head, rows, numbers)
+    return whole if len(rows) <= _MOST_OPEN else el("details", el("summary", f"{caption} ({len(rows)} rows)"), whole)
 
 
 def _most(difference: float) -> str:
@@ -159,32 +172,34 @@ def spread(entry: Entry) -> Markup | None:
     counted = [c for c in entry.report.comparisons if any(c.histogram)]
     if not counted:
         return None
-    figures = []
+    figures, same = [], []
     for output in dict.fromkeys(c.output for c in counted):
         group = [c for c in counted if c.output == output]
         equal = [c for c in group if not any(c.histogram[1:])]
+        if len(equal) == len(group):
+            same.append(output)
+            continue
         differing = [c for c in group if c not in equal]
-        picture = charts.histograms(output, differing) if differing else None
-        figures.append(_figure(output, picture, _equal_text(equal, len(group))))
+        figures.append(_figure(output, charts.histograms(output, differing), _equal_text(equal)))
     text = (
         "How many elements differ by how much, over all inputs; each bar is a decade of |Δ|, its height the square "
         "root of the count. The dashed line is the absolute tolerance; the bar on the left counts equal elements."
     )
     return section(
-        "How differences are distributed", el("p", text, class_="soft"), el("div", figures, class_="figures")
+        "How differences are distributed",
+        el("p", text, class_="soft") if figures else None,
+        el("div", figures, class_="figures") if figures else None,
+        el("p", f"Equal to the last bit in all: {', '.join(same)}.", class_="soft") if same else None,
     )
 
 
-def _equal_text(equal: Sequence[Finding], of: int) -> str | None:
+def _equal_text(equal: Sequence[Finding]) -> str | None:
     """Who was exactly the reference: they would be drawn as a line on the floor."""
-    names = ", ".join(dict.fromkeys(c.where for c in equal))
-    all_of_it = "Equal to the last bit in all." if len(equal) == of else f"Equal to the last bit: {names}."
-    return all_of_it if equal else None
+    return f"Equal to the last bit: {', '.join(dict.fromkeys(c.where for c in equal))}." if equal else None
 
 
-def _figure(title: str, picture: Markup | None, caption: str | None) -> Markup:
-    label = f"Chart of {title}"
-    box = el("div", picture, class_="scroll", tabindex=0, role="group", aria_label=label) if picture else None
+def _figure(title: str, picture: Markup, caption: str | None) -> Markup:
+    box = el("div", picture, class_="scroll", tabindex=0, role="group", aria_label=f"Chart of {title}")
     return el("figure", el("h4", el("code", title)), box, el("figcaption", caption) if caption else None)
 
 
@@ -193,18 +208,17 @@ def memory(entry: Entry) -> Markup | None:
     rolled = [c for c in entry.report.comparisons if isinstance(c, Rollout) and c.drift]
     if not rolled:
         return None
-    moving = [c for c in rolled if any(d > 0 and math.isfinite(d) for d in c.drift)]
+    moving = [c for c in rolled if _is_seen(c)]
     if not moving:
-        return section(
-            "Memory", el("p", "Fed back in each runtime, every step is equal to the reference's.", class_="soft")
-        )
+        most = max((d for c in rolled for d in c.drift if math.isfinite(d)), default=0)
+        said = f"differs by at most {most:.1g}, less than a tenth of the tolerance" if most else "is equal"
+        return section("Memory", el("p", f"Fed back in each runtime, every step {said}.", class_="soft"))
     pairs = list(dict.fromkeys((c.format, c.runtime) for c in moving))
     figures = []
-    for output in dict.fromkeys(c.output for c in rolled):
+    for output in dict.fromkeys(c.output for c in moving):
         group = [c for c in rolled if c.output == output]
-        lines = [c for c in group if c in moving]
-        picture = charts.drift(output, lines, pairs) if lines else None
-        figures.append(_figure(output, picture, _equal_text([c for c in group if not any(c.drift)], len(group))))
+        picture = charts.drift(output, [c for c in group if c in moving], pairs)
+        figures.append(_figure(output, picture, _equal_text([c for c in group if not any(c.drift)])))
     key = [
         el("li", el("i", class_=charts.colour_of(n)), f"{kind} · {runtime}") for n, (kind, runtime) in enumerate(pairs)
     ]
@@ -215,6 +229,12 @@ def memory(entry: Entry) -> Markup | None:
         el("ul", key, bound, class_="key"),
         el("div", figures, class_="figures"),
     )
+
+
+def _is_seen(c: Rollout) -> bool:
+    """Whether a drift takes a part of the tolerance that is worth a chart."""
+    most = max((d for d in c.drift if math.isfinite(d)), default=0)
+    return most > (_SEEN * c.tolerance.atol if c.passed else 0)
 
 
 def policy_graph(entry: Entry) -> Markup | None:
@@ -311,17 +331,18 @@ def tolerances(entry: Entry) -> Markup:
     ]
     if rounded:
         head = ("output", "where", "|Δ|", "rounding explains", "input")
-        content.append(table("Above the tolerance, but within what float32 rounding explains", head, rounded))
+        content.append(_folded("Above the tolerance, but within what float32 rounding explains", head, rounded))
     return section("Tolerances", content)
 
 
 def runtimes(entry: Entry) -> Markup:
-    """Which ran, in which version; why the others did not."""
-    rows = []
-    for name, state in entry.report.runtimes.items():
-        ran = state["status"] == "ran"
-        text = "ran" if ran else f"did not run: {state['reason'] or 'no reason given'}"
-        rows.append((name, state["version"] or "–", _wide(text)))
+    """Which ran, in which version; why others did not."""
+    missing = entry.missing
+    rows = [
+        (name, state["version"] or "–", _wide(f"did not run: {missing[name]}" if name in missing else "ran"))
+        for name, state in entry.report.runtimes.items()
+        if name in missing or state["status"] == "ran"
+    ]
     return section("Runtimes", table("Runtimes and their versions", ("runtime", "version", "state"), rows))
 
 

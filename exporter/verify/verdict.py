@@ -30,6 +30,9 @@ _APART = ("reference", "golden", "source", "weights")
 _OWN_WORDS = (Accepted, Decisions, Failure, Size, Stated)
 _TITLES = {"tensorflow": "TensorFlow"}
 
+#: Why a runtime did not run that is installed.
+NOT_ASKED = "not asked for"
+
 
 def runtime_title(name: str) -> str:
     """Return what people call a runtime."""
@@ -149,13 +152,13 @@ def missing_runtimes(report: ParityReport, formats: Sequence[str]) -> tuple[list
     left, install, ask = list(formats), list[str](), list[str]()
     here = [n for n, e in report.runtimes.items() if n in INDEPENDENT and e["status"] != "ran"]
     # Where one is installed that was not asked for, it need only be asked.
-    here.sort(key=lambda n: report.runtimes[n]["reason"] != "not asked for")
+    here.sort(key=lambda n: report.runtimes[n]["reason"] != NOT_ASKED)
     while left:
         runs = {n: [k for k in left if (f := WRITTEN.get(key_of(k))) and n in f.runtimes] for n in here}
         best = max(runs, key=lambda n: len(runs[n]), default=None)
         if best is None or not runs[best]:
             break
-        (ask if report.runtimes[best]["reason"] == "not asked for" else install).append(best)
+        (ask if report.runtimes[best]["reason"] == NOT_ASKED else install).append(best)
         left = [k for k in left if k not in runs[best]]
     return install, ask
 

@@ -33,7 +33,7 @@ from export_model.exporter.verify.reference import Reference
 from export_model.exporter.verify.report import ParityReport
 from export_model.exporter.verify.session import Session
 from export_model.exporter.verify.trial import Trial
-from export_model.exporter.verify.verdict import key_of, required_reason
+from export_model.exporter.verify.verdict import NOT_ASKED, key_of, required_reason
 
 #: Who takes part beside the reference: given the numpy reference and where failures go.
 Participants = Callable[[LoadedModel, Failure], Iterable[Participant]]
@@ -138,7 +138,7 @@ def _report(
     for info in session.known:
         unfit = unfit_reason(info.name, tested)
         ran = info.name in session.runtimes and (info.name in versions or info.name in tried) and not unfit
-        reason = None if ran else "not asked for" if info.installed else f"not installed; {info.how}"
+        reason = None if ran else NOT_ASKED if info.installed else f"not installed; {info.how}"
         if unfit and info.name in session.runtimes:
             reason = unfit
         states[info.name] = {

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import subprocess
 from functools import partial
 from pathlib import Path
 
@@ -13,6 +15,8 @@ from export_model.converters.formats.registry import WRITTEN
 from export_model.converters.runtimes.base import Progress
 from export_model.converters.runtimes.javascript.node import install_packages
 from export_model.converters.runtimes.registry import RUNTIMES, Runtime
+from export_model.exporter.cli.terminal import next_text
+from export_model.exporter.tables import command_text
 from fixtures import path as fixture
 from fixtures.trained import run_folder as trained_run
 from tests.commands import ROOT, export_model, files_in, is_refused
@@ -152,3 +156,35 @@ def test_installing_reports_its_steps(monkeypatch: pytest.MonkeyPatch, name: str
     monkeypatch.setattr("export_model.converters.runtimes.registry.RUNTIMES", tuple(stand_in(r) for r in RUNTIMES))
     ran = export_model("runtimes", "install", name)
     assert (ran.status, ran.out.splitlines(), ran.err) == (0, said, "")
+
+
+def test_the_help_of_runtimes_names_all_that_it_installs() -> None:
+    help_text = " ".join(export_model("runtimes", "--help").out.split())
+    names = re.findall(r"[\w-]+", help_text.partition("Install ")[2].partition(".")[0].replace(" or ", ", "))
+    able = {r.name for r in RUNTIMES if r.install is not None}
+    assert able == {r for r in able if any(r == n or r.startswith((f"{n}-", f"{n}.", f"{n}@")) for n in names)}
+    assert all(any(r.startswith(n) for r in able) for n in names)
+    assert "runtimes [OPTIONS] [install NAME]" in help_text and "Examples:" in help_text
+
+
+@pytest.mark.parametrize(("release", "profile"), [("all", "unity6"), ("R20", "barracuda-3"), ("R20,R22", "unity6")])
+def test_what_unity_does_not_read_is_to_be_exported_for_the_last_that_was_asked(release: str, profile: str) -> None:
+    answer = export_model("inspect", BALL, "--unity", release, "--json").json
+    assert answer["error"] == "SourceError"
+    assert f"--for {profile}" in answer["fix"]
+
+
+@pytest.mark.parametrize("width", [40, 60, 80, 200])
+def test_what_to_do_next_fits_the_terminal_and_can_be_pasted(width: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", str(width))
+    words = ["verify", *(f"exported/policy {i}" for i in range(9)), "it's one", "--source", "a.onnx"]
+    command = command_text(*words)
+    said = next_text(command)
+    assert all(len(line) <= width for line in said.splitlines())
+    run = said.removeprefix("next: ").replace("export-model", "printf '%s\\n'", 1)
+    typed = subprocess.run(["sh", "-c", run], capture_output=True, text=True, check=True).stdout.splitlines()
+    assert typed == words
+    prose = next_text("put the files into a project of Unity, open it there, and see what the Inspector says of them")
+    assert all(len(line) <= width for line in prose.splitlines()) and "\\" not in prose
+    monkeypatch.delenv("COLUMNS")
+    assert next_text(command) == f"next: {command}"  # nobody looks: a line stays whole

@@ -120,3 +120,12 @@ def test_a_list_may_name_a_model_that_is_called_txt(place: Path) -> None:
     (place / "more.txt").write_text("more.txt\n")
     with pytest.raises(ExportModelError, match="names another list"):
         sources_in([Path("more.txt")], Path("out"))
+
+
+@pytest.mark.parametrize("given", [".", "m*.bytes", "**/*.bytes"])
+def test_numbers_are_in_their_order(given: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = ["m1.bytes", "m2.bytes", "m10.bytes", "m10a.bytes"]
+    for name in reversed(names):
+        shutil.copy(fixture("continuous"), tmp_path / name)
+    monkeypatch.chdir(tmp_path)
+    assert [p.name for p in sources_in([Path(given)], tmp_path / "out")] == names

@@ -15,8 +15,10 @@ from msgspec.structs import replace
 
 from export_model.exporter.reports import charts
 from export_model.exporter.reports.entry import Entry, of_bundle, of_result
+from export_model.exporter.reports.markdown import markdown_text
 from export_model.exporter.reports.page import page
 from export_model.exporter.reports.sections import first_values
+from export_model.exporter.verify.findings import Rollout
 from export_model.exporter.verify.options import VerifyOptions
 from fixtures import path as fixture
 from tests.exporter.rehearsal import ActingPool, export
@@ -206,3 +208,39 @@ def test_every_name_is_text(name: str) -> None:
     is_self_contained(source, parsed)
     plain = Page(page([entry(replace(report, policy="x"))]))
     assert [t for t, _ in parsed.elements] == [t for t, _ in plain.elements]
+
+
+def test_a_report_of_one_policy_is_called_by_it_and_its_source(recurrent: tuple[Entry, Path]) -> None:
+    assert "<title>recurrent from recurrent.bytes: parity report</title>" in page([recurrent[0]])
+    assert f"<title>{PASSING.policy}: parity report</title>" in page([entry(PASSING)])  # no bundle says the source
+
+
+def test_runtimes_that_nobody_asked_for_are_not_listed() -> None:
+    states = {
+        **PASSING.runtimes,
+        "csharp": {"version": None, "status": "not run", "reason": "not installed; get mono"},  # of another format
+        "tfjs-wasm": {"version": "4.22", "status": "not run", "reason": "not asked for"},
+    }
+    made = entry(replace(PASSING, runtimes=states))
+    assert list(made.missing) == ["tfjs-cpu"]
+    for text in (Page(page([made])).text, markdown_text([made])):
+        assert "runtimes install tfjs" in text
+        assert "get mono" not in text and "not asked for" not in text
+
+
+def test_a_drift_is_drawn_only_where_it_takes_a_part_of_the_tolerance() -> None:
+    def memory(*drift: float) -> str:
+        moved = (replace(c, drift=drift) if isinstance(c, Rollout) else c for c in PASSING.comparisons)
+        return page([entry(replace(PASSING, comparisons=tuple(moved)))]).partition("<h3>Memory</h3>")[2]
+
+    assert "Fed back in each runtime, every step differs by at most 9e-07, less than a tenth" in memory(0.0, 9e-7)
+    assert "every step is equal" in memory(0.0, 0.0)
+    assert "Chart of action" in memory(0.0, 2e-6)
+
+
+def test_a_long_list_of_what_was_forgiven_is_closed() -> None:
+    rounded = [replace(c, rounding=1e-3) for c in PASSING.comparisons if c.histogram]
+    few = Page(page([entry(replace(PASSING, comparisons=tuple(rounded)))]))
+    many = Page(page([entry(replace(PASSING, comparisons=tuple(rounded * 9)))]))
+    assert many.count("details") == few.count("details") + 1
+    assert "Above the tolerance, but within what float32 rounding explains" in many.text
