@@ -37,9 +37,13 @@ def page() -> str:
 def _importers(tables: Mapping[str, Any]) -> Iterator[str]:
     profiles = tables["profiles"]
     yield from table(
-        ("importer", "of", "`--for`"),
+        ("importer", "of ML-Agents release", "`--for`"),
         (
-            (i["name"], i["release"], ", ".join(f"`{p['name']}`" for p in profiles if i["name"] in p["importers"]))
+            (
+                i["name"],
+                i["release"].split()[-1],
+                ", ".join(f"`{p['name']}`" for p in profiles if i["name"] in p["importers"]),
+            )
             for i in tables["importers"]
         ),
     )
@@ -52,12 +56,13 @@ def _readings(tables: Mapping[str, Any]) -> Iterator[str]:
     rules: dict[str, dict[tuple[str, str], list[Mapping[str, Any]]]] = {}
     for r in tables["readings"]:
         rules.setdefault(", ".join(r["ops"]), {}).setdefault((r["construct"], r["reading"]), []).append(r)
+    cells: dict[str, dict[str, list[str]]] = {}
+    for ops, of in sorted(rules.items()):
+        for (what, how), rows in of.items():
+            cells.setdefault(ops, {}).setdefault(f"*{how}* {_span(rows, versions)}", []).append(what)
     yield from table(
-        ("operators", "what is misread, how, and in which versions"),
-        (
-            (ops, "; ".join(f"{what}, *{how}* {_span(rows, versions)}" for (what, how), rows in of.items()))
-            for ops, of in sorted(rules.items())
-        ),
+        ("operators", "how they are misread, in which versions, and what of them"),
+        ((ops, ". ".join(f"{how}: {'; '.join(of)}" for how, of in cell.items())) for ops, cell in cells.items()),
     )
 
 

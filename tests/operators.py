@@ -267,9 +267,9 @@ approximated (below); the others never round. `_Fused…` are made of layers, fo
 BOUNDS = """\
 ### Approximated functions
 
-How far results are off at most: units in the last place/absolute, whichever is more. Empty: as *processor*. Measured by
-`tests/runtimes/test_approximations.py` in TensorFlow (1.4 too), onnxruntime, TensorFlow.js; *graphics*: WebGL;
-*phone*: LiteRT; *compiled*: OpenVINO.
+How far results are off at most: units in the last place/absolute, whichever is more. Measured by
+`tests/runtimes/test_approximations.py` in TensorFlow (1.4 too), onnxruntime, TensorFlow.js; in brackets where others
+differ: *graphics* (WebGL), *phone* (LiteRT), *compiled* (OpenVINO).
 """
 
 
@@ -306,14 +306,14 @@ def _matrix() -> Iterator[str]:
 
 
 def _bounds() -> Iterator[str]:
-    usual, *others = APPROXIMATIONS.values()
-    yield from table(
-        ("op", *APPROXIMATIONS),
-        (
-            [f"`{op}`", _bound(bound), *("" if o[op] == bound else _bound(o[op]) for o in others)]
-            for op, bound in usual.items()
-        ),
-    )
+    usual, *_ = APPROXIMATIONS.values()
+    others = dict(list(APPROXIMATIONS.items())[1:])
+    rows = []
+    for op, bound in usual.items():
+        apart = [f"{name} {_bound(of[op])}" for name, of in others.items() if of[op] != bound]
+        rows.append(f"`{op}` {_bound(bound)}" + (f" ({', '.join(apart)})" if apart else ""))
+    yield f"{'; '.join(rows)}."
+    yield ""
     unmeasured = [o for o in OPS if TABLE[o].precision == "approximate" and o not in usual]
     yield f"Not measured: {', '.join(f'`{op}`' for op in unmeasured)}."
 

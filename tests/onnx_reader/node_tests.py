@@ -34,7 +34,7 @@ from export_model.converters.runtimes.pool import RuntimePool
 from export_model.exporter.export.sources import read_source
 from export_model.signatures.errors import ExportModelError
 from export_model.signatures.roles import Role
-from tests.support_tables import table, write
+from tests.support_tables import write
 
 TITLE = "Operators of ONNX"
 ROWS = 3
@@ -254,11 +254,8 @@ def page(outcomes: Sequence[tuple[NodeTest, Outcome]]) -> str:
         for reason, count in reasons.items():
             by_reason.setdefault(reason, Counter())[kind] += count
     rows = sorted(by_reason.items(), key=lambda item: (-item[1].total(), item[0]))
-    lines += table(
-        ("reason", "operators"),
-        ((f"{reason}: {kinds.total()}", ", ".join(sorted(kinds))) for reason, kinds in rows),
-    )
-    return "\n".join(lines)
+    lines += (f"- {reason} ({kinds.total()}): {', '.join(sorted(kinds))}" for reason, kinds in rows)
+    return "\n".join(lines) + "\n"
 
 
 def main() -> None:
