@@ -105,6 +105,7 @@ bench: install
 	$(BIN)/python -m tests.bench.programs
 	$(BIN)/python -m tests.bench.robots
 	$(BIN)/python -m tests.bench.verification
+	$(BIN)/python -m tests.bench.layouts
 	$(BIN)/python -m tests.bench.play
 	$(BIN)/python -m tests.bench.throughput --write
 	$(BIN)/python -m tests.bench.big
