@@ -143,6 +143,16 @@ def test_code_of_older_pytorch_gives_the_same(tmp_path: Path) -> None:
     assert made == pytest.approx(golden["out"][:, 0], abs=2e-6, rel=2e-5)
 
 
+def test_what_a_module_says_beside_its_numbers_is_left_out(tmp_path: Path) -> None:
+    """A ``print`` that was left in for debugging, as in a public policy; a warning."""
+    said = '    print(input, "z", 3)\n    torch.warn("deprecated", 2)\n'
+    path = changed("mlp_script", tmp_path, ELU, said + ELU)
+    (policy,), (whole,) = (read_source(p).policies() for p in (path, FOLDER / "mlp_script.pt"))
+    assert [(n.name, n.op, n.inputs) for n in policy.graph.nodes] == [
+        (n.name, n.op, n.inputs) for n in whole.graph.nodes
+    ]
+
+
 def test_a_scripted_camera_asks_for_its_shape() -> None:
     with pytest.raises(UnsupportedOpError, match="--sensors 3x84x84"):
         read_source(FOLDER / "painted_script.pt").policies()

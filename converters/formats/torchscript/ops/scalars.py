@@ -12,7 +12,7 @@ from export_model.converters.graph.types import BOOL, FLOAT32, INT64
 from export_model.signatures.errors import SourceError, UnsupportedOpError
 
 #: Names that stand without ``torch.``.
-BARE = frozenset(("int", "float", "bool", "range"))
+BARE = frozenset(("int", "float", "bool", "range", "print"))
 _MAX_RANGE = 4096
 
 
@@ -110,7 +110,7 @@ OPS: Mapping[str, Callable[..., Any]] = {
     "list": lambda m, items: list(items),
     "append": _append,
     "format": lambda m, text, *given: text[:120] if isinstance(text, str) else "",
-    "warn": lambda m, *given: None,
+    **dict.fromkeys(("warn", "print"), lambda m, *given: None),
     "floordiv": lambda m, a, b: m.number(a // b),
 }
 NUMBERS: Mapping[str, Callable[[Any, Any], Any]] = {
