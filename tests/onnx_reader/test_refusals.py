@@ -39,6 +39,14 @@ REFUSED: Mapping[str, tuple[Sequence[Any], Mapping[str, Any], Mapping[str, Array
     "another domain": (
         [node("Gelu", ["x"], domain="com.microsoft")], X, {}, r"Gelu of com\.microsoft \(node 'y'\): its domain",
     ),
+    "an element of a sequence that is fed": (
+        [node("SplitToSequence", ["x"], "s"), node("SequenceAt", ["s", "i"])], {**X, "i": (np.int64, [])}, {},
+        r"SplitToSequence \(node 's'\): no entry of the table",
+    ),
+    "an element of a sequence far beyond": (
+        [constant("n", 1 << 62), constant("i", 3), node("SplitToSequence", ["x", "n"], "s"),
+         node("SequenceAt", ["s", "i"])], X, {}, r"SplitToSequence \(node 's'\): no entry of the table",
+    ),
     "a branch that is not known": (
         [
             node("ReduceMax", ["x"], "m", keepdims=0), constant("zero", 0), node("Greater", ["m", "zero"], "c"),

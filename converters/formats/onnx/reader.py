@@ -22,6 +22,7 @@ from export_model.converters.formats.onnx.importer.node import DTYPES
 from export_model.converters.formats.onnx.importer.table import TABLE
 from export_model.converters.formats.onnx.memories import FoundMemories, OnnxMemory, separate_memories
 from export_model.converters.formats.onnx.proto import array_of, decode_model, load_external, tensors
+from export_model.converters.formats.onnx.sequences import flatten_sequences
 from export_model.converters.graph.nodes import Graph, TensorShape
 from export_model.converters.graph.types import BATCH, Dim, TensorType
 from export_model.converters.policy.memories import looks_like_state
@@ -88,6 +89,7 @@ def read_onnx(given: Fetched, repair: str | None = None) -> OnnxModel:
     model, files = parse(given, detached)
     faults = repair_model(model, repair)
     halves = widen(model, detached)
+    flatten_sequences(model.graph, detached)
     opsets = opsets_of(model)
     graph = model.graph
     constants = {t.name for t in graph.initializer}

@@ -125,6 +125,26 @@ def expand_to_shape(opset: int) -> Sequence[Any]:
     return [constant("row", [[1, 2, 3, 4, 5]]), node("Shape", ["x"], "shape"), node("Expand", ["row", "shape"])]
 
 
+SEQUENCES = (11, 15, 18)
+
+
+def taken(title: str, position: int, lengths: Any = None, axis: int = 1, **more: Any) -> Case:
+    """An element of a tensor that is cut into a sequence, as PyTorch's exporter writes ``chunk`` in a GRUCell."""
+    cut = node("SplitToSequence", ["x"] if lengths is None else ["x", "n"], "parts", axis=axis, **more)
+    given = [] if lengths is None else [constant("n", lengths, np.int64)]
+    build = lambda _: [*given, cut, constant("i", position, np.int64), node("SequenceAt", ["parts", "i"])]  # noqa: E731
+    return Case("SequenceAt", title, build, {"x": CUBE}, opsets=SEQUENCES)
+
+
+def rejoined(axis: int) -> Case:
+    def build(_: int) -> Sequence[Any]:
+        made = [node("Neg", ["x"], "m"), node("SequenceConstruct", ["x", "m", "x"], "s"), constant("i", -2, np.int64)]
+        return [*made, node("SequenceAt", ["s", "i"], "t"), node("ConcatFromSequence", ["s"], "c", axis=axis),
+                node("Concat", ["c", "t"], axis=axis)]  # fmt: skip
+
+    return Case("ConcatFromSequence", f"axis {axis}", build, {"x": CUBE}, opsets=SEQUENCES)
+
+
 CASES = [
     Case("Constant", "a tensor", lambda _: [constant("c", [1, 2, 3, 4, 5]), node("Add", ["x", "c"])], {"x": X}),
     *(
@@ -210,6 +230,12 @@ CASES = [
     Case("Split", "equal", split(None, 5), {"x": X}, outputs=tuple(f"y{i}" for i in range(5))),
     Case("Split", "given", split([1, 4], 2), {"x": X}, outputs=("y0", "y1")),
     Case("Split", "one part is used", split([1, 3, 1], 3), {"x": X}, outputs=("y1",)),
+    *(taken(f"equal parts, {i}", i, 2, 2) for i in (0, 1)),
+    taken("the last one is shorter", 1, 2),
+    *(taken(f"given lengths, {i}", i, [1, 3], 2) for i in (0, 1, -1)),
+    taken("single elements", 2),
+    taken("single elements without their axis", 1, keepdims=0),
+    *(rejoined(axis) for axis in (1, -1)),
     Case("Split", "uneven", lambda _: [node("Split", ["x"], ["y0", "y1"], axis=1, num_outputs=2)], {"x": X},
          outputs=("y0", "y1"), opsets=(18,)),
     sliced("front", [0], [2], [2]),
