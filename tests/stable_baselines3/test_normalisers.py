@@ -99,6 +99,8 @@ def test_the_statistics_are_found_where_the_library_and_its_zoo_put_them(model: 
         (("vecnormalize.pkl", "vecnormalize_best.pkl"), "error"),
         (("VecNormalize_stats.pkl",), "error"),
         (("../vecnormalize.pkl",), "error"),
+        (("lander_vecnorm.pkl",), "error"),
+        (("../env_stats.pickle", "../vecnorm"), "error"),
         (("../vec_normalize.pkl", "../vecnormalize.pkl"), "error"),
         (("vecnormalize.pkl", "../vecnormalize.pkl"), "vecnormalize.pkl"),
         (("model_vecnormalize.pkl", "vecnormalize.pkl"), "model_vecnormalize.pkl"),
@@ -129,6 +131,13 @@ def test_all_statistics_that_were_seen_are_named_and_none_is_guessed(
     assert ("normalised inside" in notes) == (taken is not None)
     assert all(str(path) in notes for path in paths if path.name != taken or path.parent != model.parent)
     assert ("--normaliser FILE takes one" in notes) == (len(files) > 1 or taken is None)
+
+
+def test_other_pickles_beside_a_model_are_no_statistics(tmp_path: Path) -> None:
+    model = placed("ppo_box", tmp_path / "run", None)
+    (model.parent / "replay_buffer.pkl").write_bytes(pickle.dumps({"observations": [1.0, 2.0]}))
+    (model.parent / "monitor").write_bytes(b"")
+    assert not [note for note in compiled(model).signature.notes if "normalis" in note]
 
 
 def test_two_names_of_the_same_statistics_are_one(tmp_path: Path) -> None:

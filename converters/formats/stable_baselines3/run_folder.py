@@ -13,7 +13,7 @@ import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from export_model.converters.files.fetch import Fetched, path_text, unreadable
+from export_model.converters.files.fetch import Fetched, open_regular_file, path_text, unreadable
 from export_model.converters.formats.format import Member
 from export_model.converters.formats.source import ReadOptions
 from export_model.signatures.errors import SourceError
@@ -21,6 +21,9 @@ from export_model.signatures.errors import SourceError
 _STATISTICS = ("vecnormalize.pkl", "vec_normalize.pkl")
 #: What people call them, too.
 _LIKE = re.compile(r".*vec_?normali[sz]e.*\.pkl", re.IGNORECASE)
+_PICKLES = (".pkl", ".pickle", "")
+#: Bytes that the name of a pickle's own class stands in, in every protocol.
+_HEAD = 128
 _OF_A_STEP = re.compile(r"_\d+_steps$")
 _SETTINGS = ("config.yml", "args.yml")
 _UNPACKED = "policy.pth"
@@ -74,11 +77,22 @@ def _ambiguity_error(files: Sequence[Path], place: str) -> SourceError:
 
 
 def _statistics_in(folder: Path) -> list[Path]:
-    """Return the files of a folder that are called like statistics of VecNormalize."""
+    """Return the files of a folder that are called like statistics of VecNormalize, or begin as its pickles do."""
     try:
-        return sorted(p for p in folder.iterdir() if _LIKE.fullmatch(p.name) and p.is_file())
+        pickles = sorted(p for p in folder.iterdir() if p.suffix.lower() in _PICKLES and p.is_file())
     except OSError:  # a folder that may be entered and not listed
         return []
+    return [p for p in pickles if _LIKE.fullmatch(p.name) or _begins_with_its_class(p)]
+
+
+def _begins_with_its_class(file: Path) -> bool:
+    """Whether a pickle is of a VecNormalize, whatever it is called (``vecnorm.pkl``, ``env_stats.pkl``)."""
+    try:
+        with open_regular_file(file) as opened:
+            head = opened.read(_HEAD)
+    except SourceError:  # a pipe, or one that may not be read: --normaliser would say so
+        return False
+    return b"vec_normalize" in head and b"VecNormalize" in head
 
 
 def _is_anothers(file: Path, model: Path) -> bool:

@@ -132,14 +132,34 @@ def _index_select(m: Machine, x: Any, dim: Any, index: Any) -> ScriptTensor:
     return ScriptTensor(m.b.take(value, [n % length for n in places], m.b.axis(value, dim)))
 
 
-def _index(m: Machine, x: Any, indices: Any) -> ScriptTensor:
-    """``x[:, index]`` with one list of places that is known."""
+def _known_list(m: Machine, indices: Any) -> tuple[int, Any]:
+    """(axis, list of places) of ``x[:, index]`` with one list that is known."""
     given = [(axis, i) for axis, i in enumerate(indices) if i is not None]
     if len(given) != 1 or m.b.rank(m.ref(given[0][1])) != 1:
         raise UnsupportedOpError("elements are taken by several lists, or by a mask", why="one list is known")
     if m.constant_numbers(given[0][1], "which elements are taken").dtype.kind == "b":
         raise UnsupportedOpError("elements are taken by a mask", why="how many there are must be known")
-    return _index_select(m, x, *given[0])
+    return given[0]
+
+
+def _index(m: Machine, x: Any, indices: Any) -> ScriptTensor:
+    return _index_select(m, x, *_known_list(m, indices))
+
+
+def _index_put(m: Machine, x: Any, indices: Any, values: Any, accumulate: Any = False) -> ScriptTensor:
+    """``x[:, index] = values``: both joined, and of each place what it has now."""
+    axis, index = _known_list(m, indices)
+    before, length = m.ref(x), m.b.length(m.ref(x), axis)
+    places = m.constant_numbers(index, "which elements are set")
+    if not ((-length <= places) & (places < length)).all() or len({*(places % length).tolist()}) < len(places):
+        raise UnsupportedOpError(f"elements of {length} are set twice or beyond", why="which one stays is not told")
+    if accumulate:
+        raise UnsupportedOpError("it adds to elements by a list", why="setting them is known")
+    shape = [len(places) if i == axis else n for i, n in enumerate(m.b.shape(before))]
+    given = m.b.cast(m.b.broadcast(m.ref(values), shape), m.b.dtype(before))
+    order = np.arange(length)
+    order[places] = length + np.arange(len(places))
+    return ScriptTensor(m.b.take(m.b.concat([before, given], axis), order.tolist(), axis))
 
 
 # ------------------------------------------------------------------ other shapes
@@ -351,6 +371,7 @@ OPS: Mapping[str, Callable[..., Any]] = {
     "unbind": _unbind,
     "index_select": _index_select,
     "index": _index,
+    "index_put": _index_put,
     "view": _reshape,
     "reshape": _reshape,
     "_unsafe_view": _reshape,
