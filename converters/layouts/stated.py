@@ -34,6 +34,11 @@ def stated_layouts(
     if read is None:
         return []
     names, frames, stacked = read
+    if (
+        len({term.elements for term in (*terms, *interface.actions, *interface.baked) if len(term.elements) == actions})
+        > 1
+    ):
+        return []  # joints in another order than the actions: no layout here has two
     found = [
         Layout(robot, STATED, joints, names, frames=frames, stacked=stacked, project=terms[0].source)
         for robot, joints in _joints(interface, terms, robots, actions)

@@ -83,6 +83,7 @@ TERMS: Mapping[str, LayoutTerm] = {
                 "commands",
                 "command",
                 "velocity_command",
+                "keyboard_velocity_commands",
                 "generated_commands",
                 "cmd",
             ),

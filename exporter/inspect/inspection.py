@@ -20,6 +20,7 @@ from export_model.converters.interfaces.text import kept_text, loop_lines, table
 from export_model.converters.policy.policy import Policy
 from export_model.converters.policy.rules import RoleDecision
 from export_model.exporter.export.sources import read_source
+from export_model.exporter.layout.ports import robots_that_fit
 from export_model.exporter.meanings import OUTPUT_MEANINGS, feed_text
 from export_model.exporter.reports.layers import blocks_of, chain
 from export_model.exporter.tables import count_text, paragraph, size_text, table
@@ -35,6 +36,8 @@ if not TYPE_CHECKING:  # what asks a record for its signature looks these names 
 
 #: More nodes than this are no chain of layers that anybody would read.
 _MOST_NODES = 600
+#: Robots that are named.
+_MOST_ROBOTS = 4
 #: Numbers of an observation whose statistics are shown.
 _MOST_STATISTICS = 12
 
@@ -208,10 +211,10 @@ def inspection_text(inspection: Inspection) -> str:
         f"{count_text(len(inspection.policies), 'policy', 'policies')}"
         + (f"; {inspection.producer}" if inspection.producer else "")
     )
-    return "\n\n".join([paragraph(head, "", "  "), *(_policy_text(p) for p in inspection.policies)])
+    return "\n\n".join([paragraph(head, "", "  "), *(_policy_text(p, inspection.path) for p in inspection.policies)])
 
 
-def _policy_text(inspected: PolicyInspection) -> str:
+def _policy_text(inspected: PolicyInspection, path: Path) -> str:
     signature = inspected.policy.signature
     facts = [signature.family, f"{signature.action_space} actions"]
     if signature.algorithm:
@@ -229,7 +232,7 @@ def _policy_text(inspected: PolicyInspection) -> str:
         lines.append(paragraph(way, "layers: " if len(inspected.layers) == 1 else f"layers to {name}: ", "  "))
     lines += [paragraph(text, f"{name} is normalised by: ", "  ") for name, text in _normaliser_texts(signature)]
     lines += _label_lines(signature.labels)
-    lines += _interface_lines(signature)
+    lines += [*_interface_lines(signature), *_layout_lines(signature, path)]
     if signature.constants:
         lines += ["", paragraph(", ".join(f"{k}={v}" for k, v in signature.constants.items()), "constants: ", "  ")]
     lines += [paragraph(note, "note: ", "  ") for note in signature.notes]
@@ -300,6 +303,14 @@ def _interface_lines(signature: PolicySignature) -> list[str]:
     stated = [paragraph(text, "stated: ", "  ") for text in loop_lines(signature.interface)]
     kept = kept_text(signature.interface)
     return [*lines, *([""] if stated else []), *stated, *([paragraph(kept, "kept as text: ", "  ")] if kept else [])]
+
+
+def _layout_lines(signature: PolicySignature, path: Path) -> list[str]:
+    """The command that tells which number is which, where the widths are those of a known robot."""
+    robots = robots_that_fit(signature)
+    more = ", ..." if len(robots) > _MOST_ROBOTS else ""
+    text = f"export-model layout {path} (these are widths of {', '.join(robots[:_MOST_ROBOTS])}{more})"
+    return [paragraph(printable(text), "which number is which: ", "  ")] if robots else []
 
 
 def _row(spec: TensorSpec, text: str) -> list[str]:

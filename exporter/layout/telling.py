@@ -12,7 +12,7 @@ from export_model.converters.layouts.robots import Robot
 from export_model.converters.layouts.stated import stated_layouts
 from export_model.converters.layouts.terms import TERMS
 from export_model.converters.policy.policy import Policy
-from export_model.exporter.layout.evidence import Evidence, evidence_of
+from export_model.exporter.layout.evidence import NEWEST, SCALES, Evidence, evidence_of
 from export_model.exporter.layout.ranking import (
     BETTER,
     HIGHEST,
@@ -73,6 +73,7 @@ class Told(Struct, frozen=True):
             "policy": self.policy,
             "verdict": self.verdict,
             "decided": decided_facts(self),
+            "closed": closed_facts(self),
             "open": open_facts(self),
             "layout": None if self.layout is None else layout_dict(self.layout),
             "score": None if best is None else round(best.score, 4),
@@ -118,13 +119,13 @@ def tell_layout(policy: Policy, robots: Sequence[Robot]) -> Told:
     stated = None
     if policy.signature.interface is not None:
         meant = stated_layouts(policy.signature.interface, trial.vector.name, robots, trial.actions, trial.width)
-        stated = _judge(trial, ranking, meant) if meant else None
+        stated = judge_layout(trial, ranking, meant) if meant else None
     layout = stated.layout if stated else (ranking.best.members[0] if ranking.best else None)
     evidence = () if layout is None else tuple(evidence_of(trial, layout))
     return Told(policy.name, ranking, evidence, stated)
 
 
-def _judge(trial: Trial, ranking: Ranking, meant: Sequence[Layout]) -> Statement:
+def judge_layout(trial: Trial, ranking: Ranking, meant: Sequence[Layout]) -> Statement:
     """Hold what is stated against all other layouts; of several that it may mean, the one that fits best is meant."""
     scores = trial.scores([layout.mirrors() for layout in meant])
     score, layout = min(zip(scores, meant, strict=True), key=lambda pair: pair[0])
@@ -198,18 +199,29 @@ def open_facts(told: Told) -> list[dict[str, Any]]:
     for what, fact in (("robot", "robot"), ("terms", "terms")) if told.stated is None else ():
         if len(members := best.says(fact)) > 1:
             found.append({"what": what, "members": list(members), "evidence": []})
+    closed = {fact["term"] for fact in closed_facts(told)}
     for group in alike_terms(layout):
-        says = [f"{e.says}: {'as' if e.holds else 'against'} this order" for e in told.evidence if e.term in group]
-        by = f"this order is that of {layout.project}"
-        found.append({"what": "which is which", "members": list(group), "evidence": [*says, by]})
+        left = [name for name in group if name not in closed]
+        if len(left) > 1 or len(group) == len(left):
+            says = [f"{e.says}: {'as' if e.holds else 'against'} this order" for e in told.evidence if e.term in left]
+            by = f"this order is that of {layout.project}"
+            found.append({"what": "which is which", "members": left, "evidence": [*says, by]})
     by = f"this order is {layout.order}"
     found += [{"what": "which is which", "members": list(g), "evidence": [by]} for g in alike_joints(layout)]
-    never = [
-        "left and right as a whole",
-        "scales",
-        *(["whether the newest frame is first"] if layout.frames > 1 else []),
+    never = ["left and right as a whole", SCALES, *([NEWEST] if layout.frames > 1 else [])]
+    seen = {what: [e.says for e in told.evidence if e.term == what] for what in never}
+    return [*found, *({"what": what, "members": [], "evidence": says} for what, says in seen.items())]
+
+
+def closed_facts(told: Told) -> list[dict[str, str]]:
+    """Which of the terms that mirror alike is which, as far as rules of evidence say it and none says otherwise."""
+    names = [name for group in (alike_terms(told.layout) if told.layout else ()) for name in group]
+    found = {name: [e for e in told.evidence if e.term == name] for name in names}
+    return [
+        {"term": name, "says": "; ".join(e.says for e in rules)}
+        for name, rules in found.items()
+        if rules and all(e.holds for e in told.evidence if e.term in names)
     ]
-    return [*found, *({"what": what, "members": [], "evidence": []} for what in never)]
 
 
 def alike_joints(layout: Layout) -> list[tuple[str, ...]]:

@@ -16,8 +16,8 @@ from export_model.converters.graph.ops.table import hands_on
 from export_model.converters.graph.run import run_graph
 from export_model.converters.layouts.layouts import Mirrors
 from export_model.converters.policy.policy import Policy
+from export_model.exporter.layout.ports import ports_of
 from export_model.signatures.errors import UsageError
-from export_model.signatures.roles import Role
 from export_model.signatures.spec import TensorSpec
 
 #: Observations, and how far they go: in the normaliser's deviations where the policy has one, else as they are fed.
@@ -43,8 +43,8 @@ class Trial:
         drawn = np.random.default_rng(seed).standard_normal((steps, rows, self.width))
         center = 0.0 if self.mean is None else self.mean
         spread = 1.0 if self.deviation is None else self.deviation
-        self._observations = (center + SPREAD * spread * drawn).astype(np.float32)
-        acted = self._run(self._observations)
+        self.observations = (center + SPREAD * spread * drawn).astype(np.float32)
+        acted = self.act(self.observations)
         self._acted = acted - acted.mean((0, 1))
 
     @property
@@ -55,11 +55,11 @@ class Trial:
     def scores(self, mirrors: Sequence[Mirrors]) -> list[float]:
         """How well each pair of mirrors fits; what is not finite, or does not move at all, fits as chance does."""
         found: list[float] = []
-        step = max(1, _MOST_ROWS // self._observations.shape[1])
+        step = max(1, _MOST_ROWS // self.observations.shape[1])
         for start in range(0, len(mirrors), step):
             some = mirrors[start : start + step]
-            images = np.concatenate([m.apply(self._observations) for m, _ in some], axis=1)
-            parts = np.split(self._run(images), len(some), axis=1)
+            images = np.concatenate([m.apply(self.observations) for m, _ in some], axis=1)
+            parts = np.split(self.act(images), len(some), axis=1)
             found += [self._score(part, acted.apply(self._acted)) for part, (_, acted) in zip(parts, some, strict=True)]
         return found
 
@@ -69,7 +69,7 @@ class Trial:
         difference = float(((acted - wanted) ** 2).mean((0, 1)).sum())
         return difference / variance if np.isfinite(difference) and variance > 0 else 1.0
 
-    def _run(self, observations: np.ndarray) -> np.ndarray:
+    def act(self, observations: np.ndarray) -> np.ndarray:
         """Actions [steps, rows, m] for observations [steps, rows, n], from an empty memory on."""
         policy, rows = self.policy, observations.shape[1]
         feeds = {
@@ -88,16 +88,14 @@ class Trial:
 
 def _ports(policy: Policy) -> tuple[TensorSpec, TensorSpec]:
     """The observation and the action without chance. Raises UsageError for other forms of policies."""
-    signature = policy.signature
-    vectors = [s for s in signature.observations if s.role is Role.VECTOR and len(s.shape) == 2 and s.shape[-1]]
-    head = next((h for h in signature.heads if h.is_continuous), None)
-    if len(signature.observations) != 1 or len(vectors) != 1 or head is None:
+    found = ports_of(policy.signature)
+    if found is None:
         raise UsageError(
-            f"the layout of {policy.name!r} cannot be told: it takes {signature.flow}",
+            f"the layout of {policy.name!r} cannot be told: it takes {policy.signature.flow}",
             why="a mirror is tried on one row of numbers and continuous actions",
             fix="name the tensors by their roles: --input NAME=ROLE, --output NAME=ROLE",
         )
-    return vectors[0], head.plain or head.spec
+    return found
 
 
 def statistics_of(policy: Policy, vector: TensorSpec) -> tuple[np.ndarray | None, np.ndarray | None]:

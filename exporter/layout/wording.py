@@ -3,7 +3,15 @@
 from __future__ import annotations
 
 from export_model.exporter.layout.ranking import LayoutClass
-from export_model.exporter.layout.telling import AGREES, DECIDED, DISAGREES, Told, decided_facts, open_facts
+from export_model.exporter.layout.telling import (
+    AGREES,
+    DECIDED,
+    DISAGREES,
+    Told,
+    closed_facts,
+    decided_facts,
+    open_facts,
+)
 from export_model.exporter.tables import paragraph, table
 
 #: Classes that are shown, and members of each that are named.
@@ -24,6 +32,7 @@ def layout_text(told: Told) -> str:
     facts = "; ".join(f"{what}: {said}" for what, said in decided_facts(told).items())
     if facts:
         lines.append(paragraph(facts, "decided: ", "  "))
+    lines += [paragraph(f"{fact['term']} ({fact['says']})", "by its evidence: ", "  ") for fact in closed_facts(told)]
     for fact in open_facts(told):
         members = f": {', '.join(fact['members'])}" if fact["members"] else ""
         says = f" ({'; '.join(fact['evidence'])})" if fact["evidence"] else ""

@@ -10,7 +10,7 @@ from export_model.converters.layouts.conventions import BY_TERM
 from export_model.converters.layouts.layouts import Layout, term_size
 from export_model.converters.layouts.stated import frame_name
 from export_model.converters.layouts.terms import PER_JOINT, TERMS
-from export_model.exporter.layout.telling import Told, decided_facts, open_facts
+from export_model.exporter.layout.telling import Told, closed_facts, decided_facts, open_facts
 from export_model.exporter.layout.wording import verdict_text
 from export_model.signatures.errors import UsageError
 
@@ -34,6 +34,7 @@ def _text(told: Told, layout: Layout) -> str:
     elements = {"joint_names": list(layout.joints)} if named else {}
     lines = [f"# export-model layout {told.policy}: {verdict_text(told)}"]
     lines += [f"# decided, {what}: {said}" for what, said in decided_facts(told).items()]
+    lines += [f"# by its evidence, {fact['term']}: {fact['says']}" for fact in closed_facts(told)]
     for fact in open_facts(told):
         lines.append("# " + "; ".join(["open, " + fact["what"], ", ".join(fact["members"]), *fact["evidence"]]))
     lines += ["observations:", "  policy:"]
