@@ -118,10 +118,12 @@ def judge_file(
     checks: Sequence[Check] = CHECKS,
     options: VerifyOptions | None = None,
     seeded: bool = False,
+    file: Path | None = None,
+    **participant: Any,
 ) -> ParityReport:
     """As ``judge``, of a frozen graph that can be looked into: its samplers are cut, its tensors fetched.
 
-    ``again`` is what a runtime says that is started anew.
+    ``again`` is what a runtime says that is started anew, ``file`` a candidate in place of the policy's own.
     """
     tested = policy_under_test(policy, {}, folder, sizes={}, seeded=seeded)
 
@@ -130,15 +132,21 @@ def judge_file(
         return model, model.run_all
 
     def participants(numpy: Any, failed: object) -> Iterator[Participant]:
-        model = Lying(str(tested.reference), spoil)
+        model = Lying(str(file or tested.reference), spoil)
+        fed = participant.get("fed") or (lambda feeds: feeds)
+
+        def run(inputs: Sequence[Feeds], fetch: Sequence[str]) -> list[Arrays]:
+            return model.run_all([fed(feeds) for feeds in inputs], fetch)
+
         yield Participant(
             format=FROZEN_GRAPH.key,
             runtime="onnxruntime",
-            run=model.run_all,
+            run=run,
             outputs=[s.name for s in policy.signature.outputs],
             model=model,  # type: ignore[arg-type]
-            path=tested.reference,
+            path=file or tested.reference,
             again=None if again is None else load,  # type: ignore[arg-type]
+            **participant,
         )
 
     session = Session(("numpy", "onnxruntime"), KNOWN, Pool(), options or VerifyOptions())  # type: ignore[arg-type]

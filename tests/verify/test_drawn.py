@@ -19,6 +19,7 @@ from export_model.exporter.verify.checks.draws import (
     STILL_DRAWN,
     draws,
 )
+from export_model.exporter.verify.participants import write_reference
 from export_model.exporter.verify.report import ParityReport
 from tests.handmade import constant, dense, node, placeholder, sampled_policy
 from tests.verify.judged import Arrays, Feeds, compiled, judge_file
@@ -29,10 +30,10 @@ NORMAL = "random_normal/RandomStandardNormal"
 LOGITS = "logits"
 
 
-def two_branches(masked: bool = False) -> Policy:
+def two_branches(first: str = "first", second: str = "second", widths: tuple[int, int] = (3, 2)) -> Policy:
     """Two branches of three and two classes, drawn by a sampler each."""
     nodes = [placeholder("vector_observation")]
-    for name, width in (("first", 3), ("second", 2)):
+    for name, width in zip((first, second), widths, strict=True):
         nodes += [
             *dense(f"{name}_logits", "vector_observation", 3, width),
             constant(f"{name}_one", 1),
@@ -44,7 +45,7 @@ def two_branches(masked: bool = False) -> Policy:
         [
             *nodes,
             constant("axis", 1),
-            node("action", "ConcatV2", "first_draw", "second_draw", "axis", N=2, T=np.int64, Tidx=np.int32),
+            node("action", "ConcatV2", f"{first}_draw", f"{second}_draw", "axis", N=2, T=np.int64, Tidx=np.int32),
         ]
     )
 
@@ -286,6 +287,81 @@ def test_a_source_that_starts_alike_allows_it(tmp_path: Path) -> None:
     policy = noisy()
     report = judge_file(policy, tmp_path, again=lambda f, a: a, checks=(draws,), seeded=True)
     assert report.passed is True and [STARTED_ALIKE in note for note in report.notes] == [True]
+
+
+# ------------------------------------------------------------------ files of other tools
+
+
+def written(policy: Policy, folder: Path) -> Path:
+    return write_reference(policy, folder, "other")
+
+
+def _by_distribution(report: ParityReport) -> list[str]:
+    return [note for note in report.notes if "compared by distribution" in note]
+
+
+def _lifted() -> Policy:
+    nodes = [
+        placeholder("vector_observation"),
+        *dense("mean", "vector_observation", 3, 2),
+        node("size", "Shape", "mean", T=np.float32, out_type=np.int32),
+        node(NORMAL, "RandomStandardNormal", "size", dtype=np.float32, T=np.int32),
+        constant("spread", np.array([0.5, 0.2], np.float32)),
+        node("scaled", "Mul", NORMAL, "spread", T=np.float32),
+        node("action", "Add", "mean", "scaled", T=np.float32),
+    ]
+    return compiled(nodes)
+
+
+def _without_noise(policy: Policy) -> Callable[[Feeds], Feeds]:
+    noise = {s.name for s in policy.signature.noise}
+    return lambda feeds: {n: a for n, a in feeds.items() if n not in noise}
+
+
+@pytest.mark.parametrize(
+    ("output", "change", "kind"),
+    [
+        ("", lambda f, a: a, ""),
+        ("action", lambda f, a: a + 5 * _where(f), "numbers"),
+        ("action", lambda f, a: a + np.array([0, 3e-5]), "numbers"),
+        (NORMAL, lambda f, a: a * 1.15, "draws"),
+        (NORMAL, lambda f, a: a[:, :1].repeat(2, axis=1), "draws"),
+    ],
+)
+def test_a_candidate_that_draws_what_the_policy_is_fed_is_cut(
+    output: str, change: Callable[[Feeds, Array], Array], kind: str, tmp_path: Path
+) -> None:
+    policy = _lifted()
+    file = written(noisy(), tmp_path)
+    report = judged(
+        policy, tmp_path, {output: change}, file=file, fed=_without_noise(policy), drawn=frozenset({"action"})
+    )
+    assert {f[:2] for f in faults(report)} == ({(kind, "action")} if kind else set()), faults(report)
+    assert not _by_distribution(report) and any(f.output == "action" for f in report.comparisons)
+
+
+@pytest.mark.parametrize("names", [("x", "a"), ("a", "x")])
+@pytest.mark.parametrize("widths", [(3, 2), (2, 2)])
+def test_samplers_of_other_names_are_found_by_trying(
+    names: tuple[str, str], widths: tuple[int, int], tmp_path: Path
+) -> None:
+    """Whichever comes first in the file; where both fit in shape their odds tell them apart."""
+    policy = two_branches(widths=widths)
+    other = two_branches(*names, widths=widths)
+    file = written(other, tmp_path)
+    report = judged(policy, tmp_path, file=file, fed=lambda feeds: feeds)
+    assert not report.failures and report.notes == (), (faults(report), report.notes)
+    scores = _scores(other, 1)
+    wrong = judged(policy, tmp_path, {scores: lambda f, a: a * 1.5}, file=file, fed=lambda feeds: feeds)
+    assert {f.output for f in wrong.failures} == {"action"}
+
+
+def test_a_candidate_with_other_samplers_is_compared_by_distribution(tmp_path: Path) -> None:
+    """Its noise is of another kind; the note says why, and what the test sees."""
+    report = judged(noisy(), tmp_path, file=written(truncated(), tmp_path), fed=lambda feeds: feeds)
+    (note,) = _by_distribution(report)
+    assert "as its samplers are not those of the policy: a shift of half" in note and "action" in note
+    assert faults(report)
 
 
 # ------------------------------------------------------------------ files that draw otherwise
