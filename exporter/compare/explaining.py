@@ -115,6 +115,9 @@ def _explanations(
     logs = {
         side: _recording(signature, steps, _play(signature, steps, run, fetch), heads) for side, run in runs.items()
     }
+    ours, theirs = (logs[side].outputs for side in ("reference", "candidate"))
+    if any(ours[head].shape != theirs[head].shape for head in heads):
+        return  # other actions: no cause makes them these
     for side, other in (("candidate", "reference"), ("reference", "candidate")):
         answered = [s.name for s in signature.outputs] if other == "reference" else participant.outputs
         found = _explain(signature, runs[other], answered, logs[side], heads)

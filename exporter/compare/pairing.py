@@ -140,7 +140,7 @@ def _pair_specs(
 
 def _shape_notes(ours: PolicySignature, theirs: PolicySignature, outputs: Mapping[str, str]) -> Iterator[str]:
     for spec, other in ((ours.output(name), theirs.output(own)) for name, own in outputs.items()):
-        if axes_to(spec.shape, other.shape) is None:
+        if axes_to(spec.shape, other.shape) is None and alike(spec, other):
             yield f"its {other.name} is {other.shape_text}, the reference's {spec.shape_text}: the same numbers"
 
 

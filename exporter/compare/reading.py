@@ -24,7 +24,7 @@ from export_model.converters.formats.registry import FROZEN_GRAPH, KERNELS, ONNX
 from export_model.converters.formats.source import OriginalRun, ReadOptions
 from export_model.converters.policy.policy import Policy
 from export_model.converters.runtimes.pool import RuntimePool
-from export_model.exporter.compare.pairing import Pairing, axes_to, pair_policies, source_name, source_names
+from export_model.exporter.compare.pairing import Pairing, alike, axes_to, pair_policies, source_name, source_names
 from export_model.exporter.export.sources import read_source
 from export_model.exporter.verify.original import Original
 from export_model.exporter.verify.participants import Failure, Feeds, Participant
@@ -300,4 +300,6 @@ def _to_layout(array: np.ndarray, spec: TensorSpec, other: TensorSpec) -> np.nda
     order = axes_to(spec.shape, other.shape)
     if order is not None:
         return array.transpose(order) if array.ndim == len(order) else array
+    if not alike(spec, other):
+        return array  # of other numbers: the comparison says so
     return array.reshape(len(array), *(n or -1 for n in other.shape[1:]))

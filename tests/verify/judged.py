@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from export_model.converters.compiler.compile import compile_graph
 from export_model.converters.compiler.options import CompileOptions
+from export_model.converters.files.children.process import RunFailedError
 from export_model.converters.formats.frozen_graph.reader import read_graph
 from export_model.converters.formats.registry import FROZEN_GRAPH
 from export_model.converters.policy.policy import Policy
@@ -22,6 +23,7 @@ from export_model.exporter.verify.participants import Feeds, Participant, policy
 from export_model.exporter.verify.report import ParityReport
 from export_model.exporter.verify.session import Session
 from export_model.exporter.verify.verification import CHECKS, Check, verify
+from export_model.signatures.errors import ExportModelError
 from tests.handmade import graph_bytes
 
 Arrays = dict[str, npt.NDArray[Any]]
@@ -37,7 +39,16 @@ class Model:
         self._model = child._load({"path": path, **options})
 
     def run(self, feeds: Feeds, fetch: Sequence[str], **request: Any) -> Arrays:
-        return dict(self._model.run(dict(feeds), list(fetch), request))
+        try:
+            return dict(self._model.run(dict(feeds), list(fetch), request))
+        except ExportModelError as error:
+            raise RunFailedError(str(error)) from error
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        pass
 
     def run_all(
         self, inputs: Sequence[Feeds], fetch: Sequence[str], requests: Sequence[Mapping[str, Any]] = ()
@@ -101,12 +112,6 @@ class Lying(Model):
 
     def run(self, feeds: Feeds, fetch: Sequence[str], **request: Any) -> Arrays:
         return self._spoil(feeds, super().run(feeds, fetch, **request))
-
-    def __enter__(self) -> Lying:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        pass
 
 
 def judge_file(
