@@ -17,6 +17,7 @@ import datetime
 import itertools
 import json
 import statistics
+import string
 import sys
 import tempfile
 from collections import defaultdict
@@ -283,6 +284,8 @@ def write(content: Mapping[str, Any]) -> None:
 
 def _profiles(counted: Mapping[str, Any]) -> list[str]:
     """The section on ``--for``."""
+    reasons = dict.fromkeys(why for c in counted["profiles"] for why in c["refused"])
+    letters = dict(zip(reasons, string.ascii_lowercase, strict=False))
     unread = sum(counted["unread"].values())
     return [
         "## Unity",
@@ -294,21 +297,22 @@ def _profiles(counted: Mapping[str, Any]) -> list[str]:
         "and 16 agents: ONNX in onnxruntime, `.bytes` in TensorFlow 1.4 and 1.7, `.nn` by the layer rules.",
         "",
         *_table(
-            ["`--for`", "format", "held", "refused", "why"],
+            ["`--for`", "format", "held", "refused, by the reasons below"],
             _joined(
                 [
                     [
                         f"`{c['profile']}`",
                         c["format"],
                         c["held"],
-                        sum(c["refused"].values()),
-                        "; ".join(f"{why}: {n}" for why, n in c["refused"].items()),
+                        ", ".join(f"{n} {letters[why]}" for why, n in c["refused"].items()),
                     ]
                     for c in counted["profiles"]
                 ],
                 0,
             ),
         ),
+        "; ".join(f"{letter}: {why}" for why, letter in letters.items()) + ".",
+        "",
         "Not read: " + "; ".join(f"{why}: {n}" for why, n in counted["unread"].items()) + ".",
         "",
     ]
