@@ -37,6 +37,8 @@ from export_model.signatures.spec import TensorSpec
 _WRITTEN_AS = (ONNX, FROZEN_GRAPH)
 #: Inputs that only the candidate has, and what says nothing in each: no noise, every action allowed.
 _NEUTRAL = {Role.NOISE: 0.0, Role.MASKS: 1.0}
+#: What many makers call an action, and readers of files without names: it tells no maker.
+_ANYONES = frozenset(("action", "actions"))
 #: Options that each side of a comparison has its own of (exporter/cli/rows.py); the reference's have no prefix.
 APART = (
     "step",
@@ -102,9 +104,10 @@ class ReadCandidate(Struct, frozen=True):
         return replace(self, pairing=replace(self.pairing, outputs=outputs))
 
     def shares_names(self, reference: Policy) -> bool:
-        """Whether both files call an output alike: they are of one maker."""
+        """Whether both files call an output alike, by a name that not everyone gives: they are of one maker."""
         ours, theirs = (p.signature.outputs for p in (reference, self.policy))
-        return bool({n for s in ours for n in source_names(s)} & {n for s in theirs for n in source_names(s)})
+        alike = {n for s in ours for n in source_names(s)} & {n for s in theirs for n in source_names(s)}
+        return bool(alike - _ANYONES)
 
     @property
     def names(self) -> list[str]:
@@ -126,10 +129,10 @@ class ReadCandidate(Struct, frozen=True):
         return next(places, (FROZEN_GRAPH, KERNELS))
 
     def missing(self, reference: Policy) -> list[str]:
-        """Return the reference's outputs that it lacks though both are of one maker."""
-        if not self.shares_names(reference):
-            return []
-        return [s.name for s in reference.signature.outputs if s.source is not None and not self._answers(s)]
+        """Return the reference's outputs that it lacks: of one maker all that count, of another the memory."""
+        whole = self.shares_names(reference)
+        outputs = [s for s in reference.signature.outputs if whole or s.role is Role.MEMORY_OUT]
+        return [s.name for s in outputs if s.source is not None and not self._answers(s)]
 
     def _answers(self, spec: TensorSpec) -> bool:
         return spec.name in self.pairing.outputs or spec.role in self.pairing.incomparable

@@ -16,11 +16,14 @@ from onnx import numpy_helper
 from export_model.converters.formats.barracuda.format import parse
 from export_model.converters.formats.barracuda.writer import encode
 from export_model.converters.runtimes.pool import RuntimePool
+from export_model.exporter.compare import comparison
 from export_model.exporter.export.pipeline import ExportOptions, export
+from export_model.exporter.verify.options import VerifyOptions
 from export_model.exporter.verify.report import ParityReport
 from tests.commands import export_model
 from tests.comparing import compare_artefacts
 from tests.reports.validation import check_parity
+from tests.torch_checkpoint import test_state_dicts
 
 ROOT = Path(__file__).resolve().parents[2] / "fixtures"
 TORCH = ROOT / "torch_checkpoint"
@@ -159,3 +162,32 @@ def test_what_json_says_of_a_pair_fits_the_schema(right: bool, tmp_path: Path) -
     (report,) = printed["reports"]
     check_parity(json.dumps(report))
     assert report["verdict"] == ("passed" if right else "failed")
+
+
+def stripped(name: str, lost: str, folder: Path) -> tuple[Path, Path]:
+    """A checkpoint, and an ONNX of it that gives all but one output and says nothing of its maker."""
+    checkpoint = test_state_dicts.saved(folder, name)
+    read = test_state_dicts.options(name)
+    (result,) = export([checkpoint], ExportOptions(folder / "made", ("onnx",), verify="none", read=read))
+    model = onnx.load(result.folder / f"{result.policy.name}.onnx")
+    kept = [o for o in model.graph.output if o.name not in (lost, "deterministic_action")]
+    del model.graph.output[:], model.metadata_props[:]
+    model.graph.output.extend(kept)
+    onnx.save(model, folder / "theirs.onnx")
+    return checkpoint, folder / "theirs.onnx"
+
+
+@pytest.mark.parametrize(
+    ("name", "lost", "failing"),
+    [("rsl_5_5", "action_std", []), ("rsl_5_5_gru", "recurrent_out", ["recurrent_out"])],
+)
+def test_a_deviation_may_be_left_out_and_a_memory_not(
+    name: str, lost: str, failing: list[str], tmp_path: Path, pool: RuntimePool
+) -> None:
+    """That both call an action "action" does not tell that they are of one maker."""
+    checkpoint, theirs = stripped(name, lost, tmp_path)
+    options = comparison.CompareOptions(
+        judging=VerifyOptions(runtimes="onnxruntime"), read=test_state_dicts.options(name)
+    )
+    report = comparison.compare_artefacts(checkpoint, theirs, options, pool=pool)
+    assert [f.output for f in report.failures] == failing
