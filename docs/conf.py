@@ -20,8 +20,10 @@ maximum_signature_line_length = 100
 python_use_unqualified_type_names = True
 
 html_theme = "furo"
+html_logo = html_favicon = "pictures/logo.svg"
 html_title = f"export-model {__version__}"
-html_static_path: list[str] = []
+html_static_path = ["style"]
+html_css_files = ["site.css"]
 html_copy_source = False
 html_show_sphinx = False
 add_module_names = False

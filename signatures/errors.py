@@ -15,7 +15,7 @@
     ├── ProfileError            2  a consumer (--for) cannot hold the policy
     ├── BundleError             2  a bundle is missing, incomplete or has been changed
     ├── ParityError             1  two runtimes disagree
-    ├── RunFailedError          1  a runtime refused a model (files/children/process.py); verification reports it
+    ├── RunFailedError          1  a runtime refused a model; verification reports it
     └── RuntimeUnavailableError 3  a runtime that was asked for is not installed, or did not start
 """
 

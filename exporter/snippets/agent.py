@@ -75,7 +75,7 @@ def _head(bundle: SnippetBundle, sensors: list[TensorSpec], vector: TensorSpec |
         f"  Vector Observation: Space Size {size}, Stacked Vectors 1",
         f"  Actions: Continuous Actions {_continuous(bundle)}, Discrete Branches {len(signature.branches)}"
         + (f" of the sizes {sizes}" if sizes else ""),
-        f"  Model: {_model(bundle)}; Behavior Type: Inference Only",
+        *textwrap.wrap(f"  Model: {_model(bundle)}; Behavior Type: Inference Only", 96, subsequent_indent="    "),
     ]
     others = [s for s in sensors if s is not vector]
     if others:

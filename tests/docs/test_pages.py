@@ -74,6 +74,15 @@ def test_every_block_has_a_language_that_is_tested() -> None:
     assert found <= set(HOW)
 
 
+#: Characters of a line of code that the site shows beside both its sidebars at 1280 pixels.
+WIDTH = 100
+
+
+def test_no_line_of_code_is_wider_than_the_site_shows() -> None:
+    lines = [(b.where, line) for page in pages() for b in blocks(page) for line in b.text.splitlines()]
+    assert [(where, line) for where, line in lines if len(line) > WIDTH and "::" not in line] == []
+
+
 def test_pages_with_tests_of_their_own_have_them() -> None:
     assert set(map(name_of, HERE)) >= EVERY
     for page, test in ELSEWHERE.items():

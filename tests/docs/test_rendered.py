@@ -26,7 +26,10 @@ img { max-width: 100%; } code { font-family: monospace; }
 #: What sticks out of the window, and which pictures are broken.
 LOOK = """[document.documentElement.scrollWidth - innerWidth,
   [...document.images].filter((i) => i.complete && !i.naturalWidth).map((i) => i.getAttribute("src"))]"""
-PAGES = ("index", "start", "unity", "comparison", "interface")
+PAGES = ("index", "start", "robots", "python-guide", "interface", "tasks/unity-old-brain")
+#: How far lines of a block of code go beyond it.
+CUT = """[...document.querySelectorAll("pre")].filter((p) => p.scrollWidth > p.clientWidth + 1)
+  .map((p) => p.innerText.split("\\n").sort((a, b) => b.length - a.length)[0])"""
 
 
 def layouts(address: str) -> list[tuple[int, list[str]]]:
@@ -64,3 +67,9 @@ def test_readme_fits_the_window(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", PAGES)
 def test_a_page_of_the_site_fits_the_window(site: Path, name: str) -> None:  # noqa: F811
     assert layouts((site / f"{name}.html").as_uri()) == [(0, [])] * 4
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_no_line_of_code_is_cut_on_a_wide_window(site: Path, name: str) -> None:  # noqa: F811
+    page = visit((site / f"{name}.html").as_uri(), [["viewport", *SIZES[0]], ["eval", CUT]])
+    assert page.results[-1] == []
