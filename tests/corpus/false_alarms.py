@@ -3,18 +3,22 @@
 Every model file of ../shared/genuine is exported to four formats and verified in every runtime that is installed (no
 browser), once per seed. None of them has a fault, so every failed comparison is a false alarm. It prints a line per
 alarm and the figures, and ends with status 1 where there was one. Files that are refused (one .nn is known to compute
-something else than was trained) are counted apart.
+something else than was trained) are counted apart. ``--rooms genuine,corpus,corpus4,foreign`` has all of ../shared,
+``--to`` other formats, and ``--minutes`` as many as there is time for, in an order of chance.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
+import random
 import sys
 import tempfile
 import time
 import zlib
 from collections.abc import Iterator, Sequence
+from itertools import product
 from pathlib import Path
 
 from export_model.converters.runtimes.pool import RuntimePool
@@ -22,10 +26,18 @@ from export_model.exporter.export.pipeline import ExportOptions, export
 from export_model.exporter.reports.summary import failure_lines
 from export_model.exporter.verify.options import VerifyOptions
 from export_model.exporter.verify.report import ParityReport
-from export_model.signatures.errors import SourceError
+from export_model.signatures.errors import ExportModelError
+from tests.known import SHARED, sources
 
 GENUINE = Path(__file__).resolve().parents[3] / "shared" / "genuine"
 SEEDS = tuple(range(10))
+
+
+def model_files(rooms: Sequence[str]) -> list[Path]:
+    """Every model file of these rooms of ../shared."""
+    every = [p for p in sources() if p.relative_to(SHARED).parts[0] in rooms and "genuine" not in p.parts]
+    others = [p for p in sorted((SHARED / "corpus4").glob("*")) if p.suffix != ".jsonl"]
+    return [*(genuine_files() if "genuine" in rooms else ()), *every, *(others if "corpus4" in rooms else ())]
 
 
 def seed_of(source: Path) -> int:
@@ -43,10 +55,12 @@ def genuine_files(folder: Path = GENUINE) -> list[Path]:
     return [*frozen, *sorted(folder.glob("*/*.nn")), *sorted(folder.glob("*/*.onnx"))]
 
 
-def verified(source: Path, seed: int, pool: RuntimePool, runtimes: str = "auto") -> list[ParityReport]:
+def verified(
+    source: Path, seed: int, pool: RuntimePool, runtimes: str = "auto", formats: Sequence[str] | None = None
+) -> list[ParityReport]:
     """The reports on the policies of one file."""
     with tempfile.TemporaryDirectory() as scratch:
-        options = ExportOptions(Path(scratch), verify=runtimes, parity=VerifyOptions(seed=seed))
+        options = ExportOptions(Path(scratch), formats, verify=runtimes, parity=VerifyOptions(seed=seed))
         return [r.report for r in export([source], options, pool=pool) if r.report is not None]
 
 
@@ -55,22 +69,32 @@ def alarms(report: ParityReport) -> list[str]:
     return failure_lines(report) if report.passed is not None else ["  not verified"]
 
 
-def measured(sources: Sequence[Path], seeds: Sequence[int], runtimes: str = "auto") -> Iterator[dict[str, object]]:
-    """One record per file and seed, seed by seed."""
+def measured(
+    given: Sequence[tuple[int, Path]], runtimes: str = "auto", formats: Sequence[str] | None = None
+) -> Iterator[dict[str, object]]:
+    """One record per seed and file."""
     with RuntimePool() as pool:
-        for seed in seeds:
-            for source in sources:
-                start = time.monotonic()
-                where = "/".join(source.parts[-2:])
-                try:
-                    reports = verified(source, seed, pool, runtimes)
-                    found, refused = [line for report in reports for line in alarms(report)], None
-                    count = sum(len(r.comparisons) for r in reports)
-                except SourceError as error:
-                    found, refused, count = [], error.what, 0
-                seconds = round(time.monotonic() - start, 2)
-                yield {"seed": seed, "source": where, "comparisons": count, "alarms": found, "refused": refused,
-                       "seconds": seconds}  # fmt: skip
+        for seed, source in given:
+            start = time.monotonic()
+            where = "/".join(source.parts[-2:])
+            count = pairs = 0
+            try:
+                reports = verified(source, seed, pool, runtimes, formats)
+                pairs = sum(len(r.pairs) for r in reports)
+                found, refused = [line for report in reports for line in alarms(report)], None
+                count = sum(len(r.comparisons) for r in reports)
+            except ExportModelError as error:
+                found, refused, count = [], error.what, 0
+            seconds = round(time.monotonic() - start, 2)
+            yield {
+                "seed": seed,
+                "source": where,
+                "pairs": pairs,
+                "comparisons": count,
+                "alarms": found,
+                "refused": refused,
+                "seconds": seconds,
+            }
 
 
 def main() -> int:
@@ -79,16 +103,27 @@ def main() -> int:
     parser.add_argument("--only", default="", help="only files whose path holds this")
     parser.add_argument("--runtimes", default="auto", help="as --verify: only these, comma-separated")
     parser.add_argument("--records", type=Path, metavar="FILE", help="write a JSON record per file and seed here")
+    parser.add_argument("--rooms", default="genuine", help="folders of ../shared, comma-separated")
+    parser.add_argument("--to", help="formats, comma-separated")
+    parser.add_argument("--minutes", type=float, help="stop then, and take files and seeds by chance")
     options = parser.parse_args()
-    sources = [s for s in genuine_files() if options.only in str(s)]
-    if not sources:
-        print("not measured: ../shared/genuine is not beside this checkout")
+    found = [s for s in model_files(options.rooms.split(",")) if options.only in str(s)]
+    if not found:
+        print("not measured: ../shared is not beside this checkout")
         return 0
-    runs = comparisons = wrong = 0
+    given, end = list(product(range(options.seeds), found)), math.inf
+    if options.minutes is not None:
+        random.Random(0).shuffle(given)
+        end = time.monotonic() + 60 * options.minutes
+    formats = options.to and options.to.split(",")
+    runs = pairs = comparisons = wrong = 0
     refused: set[str] = set()
     seconds = 0.0
-    for record in measured(sources, range(options.seeds), options.runtimes):
+    for record in measured(given, options.runtimes, formats):
+        if time.monotonic() > end:
+            break
         runs += 1
+        pairs += int(str(record["pairs"]))
         comparisons += int(str(record["comparisons"]))
         seconds += float(str(record["seconds"]))
         refused |= {str(record["source"])} if record["refused"] else set()
@@ -101,7 +136,8 @@ def main() -> int:
             with options.records.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(record) + "\n")
     print(
-        f"{len(sources)} files, {options.seeds} seeds: {runs} verifications, {comparisons} comparisons, {wrong} alarms"
+        f"{len(found)} files, {options.seeds} seeds: {runs} verifications, {pairs} of a format in a runtime, "
+        f"{comparisons} comparisons, {wrong} alarms"
     )
     print(f"{seconds:.0f} s; refused: {', '.join(sorted(refused)) or 'none'}")
     return 1 if wrong else 0
