@@ -3,7 +3,8 @@
 Without flags a sample of policies of fixtures/, as ``make test`` has it. ``--whole`` has every class once in every
 policy of fixtures/ and ../shared (hours), each of ../shared written in one of many ways by ``--seed``; ``--policies 9``
 takes nine of each family, ``--faults 5`` five classes for each policy, those that its family had least; ``--every``
-has every tensor that can have it. ``--write`` keeps the table in docs/figures.json, which docs/figures.md is made of.
+has every tensor that can have it, ``--minutes 15`` what there is time for. ``--write`` keeps the table in
+docs/figures.json, which docs/figures.md is made of.
 """
 
 from __future__ import annotations
@@ -11,9 +12,11 @@ from __future__ import annotations
 import argparse
 import datetime
 import json
+import math
 import random
 import sys
 import tempfile
+import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
@@ -127,6 +130,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0, help="chooses policies, and how each is written")
     parser.add_argument("--policies", type=int, help="so many of every family")
     parser.add_argument("--faults", type=int, help="so many classes of each policy")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="stop then")
     parser.add_argument("--only", default="", help="only policies whose family, name or format holds this")
     parser.add_argument("--ways", default="", help="export, verify, compare: each fault in all of these")
     parser.add_argument("--write", action="store_true", help="keep the table in docs/figures")
@@ -137,7 +141,7 @@ def main() -> int:
     given = (m for m in given if options.only in f"{m.family} {m.label}")
     if options.policies is not None:
         given = some(given, options.policies, options.seed)
-    found = []
+    found, end = [], time.monotonic() + 60 * options.minutes
     with RuntimePool() as pool:
         ways = [w for w in options.ways.split(",") if w]
         sound = options.whole or bool(options.only)
@@ -149,6 +153,8 @@ def main() -> int:
                 outcome.verdict,
             ) == ("no fault", "caught"):
                 print(outcome, flush=True)
+            if time.monotonic() > end:
+                break
     words = [a for a in sys.argv[1:] if a != "--write"]
     content = counted(found, " ".join(["python -m tests.faults", *words]))
     if options.write:
