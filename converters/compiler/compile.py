@@ -214,7 +214,7 @@ def _chosen_brains(brains: tuple[GraphBrain, ...], wanted: str | None) -> tuple[
         names = [b.label for b in brains if b.label]
         raise UsageError(
             f"--brain {wanted}: unknown brain",
-            why=None if names else "the policy of this file has no name of its own",
+            why=None if names else "the policy of this file has no name",
             fix=f"this graph has: {', '.join(names)}" if names else "leave --brain out",
         )
     return chosen

@@ -134,7 +134,7 @@ def profile(name: str) -> Profile:
             return known
     close = suggestion(name.lower(), (n for p in PROFILES for n in (p.name, *p.aliases)))
     raise UsageError(
-        f"--for {name}: unknown profile",
+        f"--for {name}: no such name",
         why=editor_hint(name),
-        fix=f"{close}the profiles are {', '.join(p.name for p in PROFILES)}",
+        fix=f"{close}the names are {', '.join(p.name for p in PROFILES)}",
     )

@@ -91,7 +91,7 @@ def unpickle_objects(
 
 
 def _no_storage(identity: tuple[Any, ...]) -> Any:
-    raise damaged_error("a tensor stands where none belongs")
+    raise damaged_error("found a tensor where another value is expected")
 
 
 class _Objects(PickleMachine):

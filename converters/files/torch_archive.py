@@ -209,7 +209,7 @@ class Archive:
 
 
 def _none(identity: tuple[Any, ...]) -> Storage:
-    raise _damaged_error("a tensor stands where none belongs", "the pickle is damaged")
+    raise _damaged_error("found a tensor where another value is expected", "the pickle is damaged")
 
 
 def _damaged_error(what: str, why: str) -> DamagedFileError:

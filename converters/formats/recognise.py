@@ -64,7 +64,7 @@ REFUSED = (
     Format(
         key="unity_asset",
         label="a Unity asset, which only refers to a model or wraps it",
-        advice="give the .nn, .onnx or .bytes file itself, as it lies in the project's Assets folder",
+        advice="give the .nn, .onnx or .bytes file itself, from the project's Assets folder",
         sniff=lambda file: file.starts(*_UNITY_ASSET) or b"%TAG !u!" in file.head[:64],
     ),
     Format(

@@ -44,7 +44,7 @@ def placed_joints(root: Element, name: str) -> list[PlacedJoint]:
         else:
             raise ValueError(f"its root is <{short_text(root.tag, 40)}>, not <robot> (URDF) or <mujoco> (MJCF)")
         if len({joint.name for joint in found}) < len(found) or not found or not all(joint.name for joint in found):
-            raise ValueError("its moving joints must have names, each of its own")
+            raise ValueError("its moving joints must have names, each another")
     except ValueError as error:
         fix = "give the URDF or the whole MJCF, or the robot's joints as YAML"
         raise DamagedFileError("is not a robot's file", where=name, why=str(error), fix=fix) from error

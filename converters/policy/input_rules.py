@@ -216,7 +216,7 @@ BY_READERS: tuple[Rule[Read, Role], ...] = (
         "it is rows of numbers for each agent, of no fixed number",
     ),
     Rule(Role.VECTOR, _has_several_axes, "it is numbers along several axes of fixed lengths: a board or a grid"),
-    Rule(Role.PARAMETER, always, "no name that is known and nothing that reads it tells what it is for"),
+    Rule(Role.PARAMETER, always, "no name that is known and nothing that reads it says what it is for"),
 )
 
 

@@ -29,7 +29,7 @@ from export_model.signatures.errors import SignatureError, UsageError
 from export_model.signatures.roles import INPUT_ROLES, OBSERVATIONS, Role
 
 #: What is said of an input that is its own.
-_TOLD, _KNOWN, _DEFAULT = "--input says so", "the format says so", "it has a value of its own, and nothing names it"
+_TOLD, _KNOWN, _DEFAULT = "--input says so", "the format says so", "it has a default value, and nothing names it"
 
 
 def classify_inputs(

@@ -82,7 +82,7 @@ def _rebuild(saved: Saved, folder: Path) -> Rebuilt:
         algorithm=recipe.algorithm or ("PPO" if saved.settings and saved.settings["critic"] else ""),
         outputs={"action": Role.ACTION},
         notes=(
-            "no runtime but JAX with brax reads it: the verdict on the export is that its formats are self-consistent",
+            "no runtime but JAX with brax reads it: its formats are compared with each other only (self-consistent)",
             f"the action is brax' with deterministic=True; observations are {'' if recipe.normalised else 'not '}"
             f"normalised, as {recipe.said_by} says",
         ),

@@ -55,8 +55,8 @@ def _unknown_error(value: Any) -> NotAPolicyError:
     if maker := _other_trainer(value):
         return NotAPolicyError(
             f"is a checkpoint of {maker}, whose networks are not rebuilt",
-            why=f"it holds weights ({_content(value)}); which activations and layers they belong to stands in "
-            "the run's configuration and code",
+            why=f"it holds weights ({_content(value)}); their layers and activations are recorded only in the "
+            "run's configuration and code",
             fix=f"load it in {maker}, export the module that gives the action (torch.onnx.export, the "
             "observation's normaliser included), and give the .onnx",
         )

@@ -51,7 +51,7 @@ def _rebuild(saved: Saved, arguments: Any) -> Rebuilt:
     if name not in _CLASSES:
         raise SourceError(
             f"its module is {name[:80]}, which is not built here",
-            why=f"of RLlib's modules {', '.join(_CLASSES[:2])} are; what others compute stands in their code",
+            why=f"of RLlib's modules {', '.join(_CLASSES[:2])} are; what others compute is only in their code",
             fix=_EXPORT_ONNX,
         )
     graph, facts = _rebuild_actor(saved, named)

@@ -103,8 +103,8 @@ def _deviation(net: Network, mean: str, layout: _Layout) -> dict[str, Role]:
             per_action(net, mean, net.state.array(module, net.width(mean)), name)
             return {name: role}
     raise net.state.damaged_error(
-        "its policy has no deviation of its own",
-        "it has none, or one that depends on the observation, or is not a Gaussian: which, the weights do not tell",
+        "its policy has no deviation",
+        "it has none, or one that depends on the observation, or is not a Gaussian: the weights do not say which",
     )
 
 

@@ -51,7 +51,7 @@ def _rebuild(saved: Saved, state: dict[Any, Any]) -> Rebuilt:
         "Sample Factory",
         _FILES,
         _KEYS,
-        why="which activation, memory and normaliser they belong to stands in the settings of its run",
+        why="activation, memory and normaliser are recorded only in the run's settings",
         fix="put the run's config.json next to the checkpoint, or give the .pth where the run left it",
         has="it (nonlinearity)",
     )
@@ -69,8 +69,8 @@ def _rebuild_actor(saved: Saved, state: Mapping[Any, Any], settings: Settings) -
         width = weights.length(f"{_HEAD}.distribution_linear.weight", 0)
         raise SourceError(
             f"its {width} numbers for actions may be of one choice, of several, or means and deviations",
-            why="the space of actions is the environment's, and stands in no file of the run; with adaptive_stddev "
-            "false the deviation is a weight of its own, and such policies are built",
+            why="the action space is the environment's, and no file of the run records it; with adaptive_stddev "
+            "false the deviation is a separate weight, and such policies are read",
             fix=_EXPORT_ONNX,
         )
     weights.forget(*_TRAINING)

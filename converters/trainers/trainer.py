@@ -54,7 +54,7 @@ class Saved(Struct, frozen=True):
         """
         if len(self.sensors) != 1 or len(self.sensors[0]) != 3:
             raise SourceError(
-                "the checkpoint does not tell the size of the image that it sees",
+                "the checkpoint does not say the size of the image that it sees",
                 why="convolutions take any",
                 fix=f"say it: --sensors {channels}x84x84 (channels, height, width{channels_are})",
             )

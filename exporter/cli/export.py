@@ -46,7 +46,9 @@ if TYPE_CHECKING:
 @click.argument("sources", nargs=-1, type=PATH, metavar="SOURCE...")
 @click.option("-o", "--out", type=PATH, default=Path("exported"), help="Folder for the bundles, or an address.")
 @click.option("--to", "targets", metavar="FORMATS", help="bytes,saved_model,tfjs,onnx; or nn,litert,c,csharp,js.")
-@click.option("--for", "profile", metavar="NAME", help="Make the files for one consumer; 'help' lists them.")
+@click.option(
+    "--for", "profile", metavar="NAME", help="Make the files for what loads them (unity6, …); 'help' lists all."
+)
 @click.option("--name", metavar="NAME", help="The policy's name (default: the file's).")
 @click.option(
     "--names",
@@ -220,7 +222,7 @@ def _check_playable(env: str, sources: int, runtimes: str, profile: str | None, 
     if profile is not None:
         raise UsageError(
             f"--env does not go with --for {profile}",
-            why="files with a consumer's names lack outputs that a reading of them has",
+            why="files with the names of --for lack outputs that are compared in play",
             fix="export without --for to play; --for is held against the source by its numbers",
         )
     if bake is not None:

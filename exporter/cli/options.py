@@ -228,10 +228,14 @@ def coding(command: Callable[..., Any]) -> Callable[..., Any]:
         return command(*args, code=code_options(math, weights, outputs_of, guard), **rest)
 
     for option in (
-        click.option("--guard", type=float, metavar="K", help="Source code: tell of observations beyond K sigma."),
-        click.option("--outputs", "outputs_of", metavar="WHOSE", default="actor", help="Source code: actor, or all."),
+        click.option("--guard", type=float, metavar="K", help="Source code: count observations beyond K sigma."),
+        click.option(
+            "--outputs", "outputs_of", metavar="actor|all", default="actor", help="Source code: the outputs it has."
+        ),
         click.option("--weights", metavar="PLACE", default="source", help="Source code: weights in a file beside it."),
-        click.option("--math", metavar="WHOSE", default="library", help="Source code: own, the same bits anywhere."),
+        click.option(
+            "--math", metavar="library|own", default="library", help="Source code: own gives the same bits anywhere."
+        ),
     ):
         parse_and_call = option(parse_and_call)
     return parse_and_call

@@ -52,7 +52,13 @@ READING = (
     Row("script", "--script", "Script that saved a bare .pt: ppo-pytorch-continuous, …", "NAME"),
     Row("repair", "--repair", "Mend an exporter's fault: gru-reset, antialias, …", "NAME"),
     Row("normaliser", "--normaliser", "Statistics of a .zip: vecnormalize.pkl, if not next to it.", "FILE", FILE),
-    Row("interface", "--interface", "YAML that states the interface (default: beside), or none.", "FILE", FILE),
+    Row(
+        "interface",
+        "--interface",
+        "YAML with the interface (default: the one next to the source), or none.",
+        "FILE",
+        FILE,
+    ),
     Row("trust_source", "--trust-source", "Let Keras or PyTorch load a file whole: its code can run.", both=True),
 )
 #: What stands before an option that is for the candidates of a comparison, not for the reference.

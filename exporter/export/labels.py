@@ -49,7 +49,8 @@ def with_labels(policy: Policy, labels: Mapping[str, Any] | None, source: str = 
         named = labels["policies"]
         if not isinstance(named, Mapping) or len(labels) > 1:
             raise UsageError(
-                "labels: 'policies' stands alone and holds the labels by policy", fix="see docs/python-guide.md"
+                "labels: 'policies' must be the only key, and holds the labels by policy",
+                fix="see docs/python-guide.md",
             )
         labels = named.get(policy.name)
     if labels is None:

@@ -165,7 +165,7 @@ def _difference(stated: Layout, other: LayoutClass) -> str:
     if near.robot.key != stated.robot.key:
         words.append(f"the robot seems to be {near.robot.title}")
     elif near.joints != stated.joints:
-        words.append(f"the joints seem to stand {near.order}")
+        words.append(f"the joints seem to be ordered {near.order}")
     if near.terms != stated.terms:
         words.append(f"the terms seem to be {', '.join(near.terms)}")
     return "; ".join(words) or "another layout fits better"

@@ -130,7 +130,7 @@ def returns_section(report: PlayReport) -> Markup:
         (
             "Mean difference and its interval",
             pictures.intervals(report),
-            "Dashed: the margin. An interval has to lie within it.",
+            "Dashed: the margin. An interval has to be within it.",
         ),
         ("Returns", pictures.returns(report), "From the 5th to the 95th percentile of episodes; the dot is the mean."),
         ("Survival", pictures.survival(report), "The share of episodes that still go on after so many steps."),

@@ -76,7 +76,7 @@ def _fetch(address: str, folder: Path) -> Path:
         raise SourceError(
             f"has {len(found)} files, and of one source {MAX_FILES} are fetched",
             where=path_text(address),
-            fix="give the folder of one run, or a pattern that stands for files: **/*.onnx",
+            fix="give the folder of one run, or a pattern that matches files: **/*.onnx",
         )
     left = MAX_REMOTE_BYTES - sum(info.get("size") or 0 for info in found.values())
     _within(left, address)

@@ -140,10 +140,10 @@ def excuses(entry: Entry) -> Markup | None:
     ]
     head = ("format", "runtime", "output", "rule", "elements", "largest difference")
     caption = "Elements beyond the tolerance that a rule forgave: docs/agreement.md says what each may hide"
-    return section("Forgiven", _folded(caption, head, rows, (4, 5))) if rows else None
+    return section("Forgiven", _closed_table(caption, head, rows, (4, 5))) if rows else None
 
 
-def _folded(
+def _closed_table(
     caption: str, head: Sequence[Child], rows: Sequence[Sequence[Child]], numbers: Sequence[int] = ()
 ) -> Markup:
     """A table that says one thing often: closed where it is long."""
@@ -331,7 +331,7 @@ def tolerances(entry: Entry) -> Markup:
     ]
     if rounded:
         head = ("output", "where", "|Δ|", "rounding explains", "input")
-        content.append(_folded("Above the tolerance, but within what float32 rounding explains", head, rounded))
+        content.append(_closed_table("Above the tolerance, but within what float32 rounding explains", head, rounded))
     return section("Tolerances", content)
 
 

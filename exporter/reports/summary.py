@@ -38,7 +38,7 @@ def foreign_words(report: ParityReport) -> list[str]:
     lines = []
     for found in report.failures:
         if isinstance(found, Failure) and found.said:
-            lines += [f"{found.where} said, in words of its own:"]
+            lines += [f"{found.where} said, in its own words:"]
             lines += [f"  | {printable(line)}" for line in found.said.splitlines()]
     return lines
 

@@ -63,7 +63,7 @@ class Destinations(Struct, frozen=True):
             if path.is_dir():
                 raise UsageError("is a folder", where=str(path), fix="name a file for the report")
             if paths.count(path) > 1:
-                raise UsageError("is named for two reports", where=str(path), fix="give each a file of its own")
+                raise UsageError("is named for two reports", where=str(path), fix="give each its own file")
             with _reporting(path):
                 path.parent.mkdir(parents=True, exist_ok=True)
                 if path.is_file() and not _is_summary(path):

@@ -112,8 +112,8 @@ def reference_text(report: ParityReport) -> str:
     if runtime:
         return f"the bundle's own {WRITTEN[kind].main_of('')}"
     if report.self_consistent:
-        return "export-model's reading of the original, which nothing else here can run"
-    return "export-model's reading of the original, which was not run"
+        return "the original as export-model reads it, which nothing else here can run"
+    return "the original as export-model reads it, which was not run"
 
 
 def _by_kernels(report: ParityReport) -> str:

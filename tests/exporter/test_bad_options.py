@@ -42,7 +42,7 @@ def out(tmp_path: Path) -> Iterator[Path]:
         (["--to", "bytes,onnx,coreml"], ["--to coreml"]),
         (["--to", ""], ["--to names no format", "bytes, saved_model, tfjs, onnx"]),
         (["--to", ","], ["--to names no format"]),
-        (["--brain", "Ball"], ["--brain Ball", "no name of its own"]),
+        (["--brain", "Ball"], ["--brain Ball"]),
         (["--input", "state"], ["--input state: NAME=VALUE is expected"]),
         (["--input", "=noise"], ["NAME=VALUE is expected"]),
         (["--input", "state=observations"], ["--input state=observations", "the roles are", "vector_observation"]),

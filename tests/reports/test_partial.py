@@ -93,7 +93,7 @@ def test_the_verdict_is_a_sentence_that_is_true() -> None:
     head = "PASSED: onnx (1 of 3 formats; install tensorflow to check the others) agrees with "
     assert verdict(made()) == f"{head}the original in TensorFlow"
     unasked = made(original=None, reference="numpy")
-    assert verdict(unasked) == f"{head}export-model's reading of the original, which was not run"
+    assert verdict(unasked) == f"{head}the original as export-model reads it, which was not run"
     alone = replace(unasked, self_consistent=True)
     assert verdict(alone).startswith("SELF-CONSISTENT: onnx (1 of 3 formats; install tensorflow ")
     assert verdict(alone).endswith("which nothing else here can run")

@@ -116,7 +116,7 @@ def custom(name: str, module: str = "__main__") -> dict[str, Any]:
     ("name", "data", "words"),
     [
         ("a2c_discrete", {"policy_class": custom("Mine")}, "its class is of __main__"),
-        ("a2c_discrete", {"policy_class": None}, "its class is not told"),
+        ("a2c_discrete", {"policy_class": None}, "its class"),
         (
             "ppo_eye",
             {"policy_kwargs": {"features_extractor_class": "<class '__main__.MyEyes'>"}},

@@ -64,7 +64,7 @@ ELU = "    _0 = __torch__.torch.nn.functional.elu(input, 1., False, )\n"
         ("    a = [1, 1]\n" + "    a = [a, a]\n" * 60 + "    _0 = input\n", "a list of more than"),
         ("    a = 3\n" + "    a = torch.mul(a, a)\n" * 90 + "    _0 = input\n", "more than 62 bits"),
         ("    _0 = torch.linear(input, input)\n", "torch.linear"),
-        ("    _0 = missing\n", "a Named stands where a tensor is expected"),
+        ("    _0 = missing\n", "where a tensor is expected"),
         ("    if input:\n      _0 = input\n    else:\n      _0 = input\n", "which way it goes on"),
         ("    self.count = 3\n    _0 = input\n", "count"),
         ("    _0 = __torch__.nowhere.f(input, )\n", "its code has no __torch__.nowhere.f"),

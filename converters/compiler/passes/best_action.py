@@ -63,7 +63,7 @@ def rank_actions(c: Compilation) -> Compilation:
     if evidence is None:
         return _add_note(
             c,
-            f"nothing tells whether {given.name} holds continuous actions or values of discrete ones (Q-values, "
+            f"nothing says whether {given.name} holds continuous actions or values of discrete ones (Q-values, "
             "scores); it is exported as continuous actions; if the largest is the action: "
             f"--output {given.name}=q_values",
         )

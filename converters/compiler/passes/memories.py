@@ -127,7 +127,7 @@ def _memories_from_user(graph: Graph, inputs: Sequence[str], outputs: Sequence[s
         raise SignatureError(
             f"{len(inputs)} inputs are memories ({', '.join(inputs) or 'none'}), and {len(outputs)} outputs "
             f"({', '.join(outputs) or 'none'})",
-            why="each memory is fed back from an output of its own",
+            why="each memory needs its own output to be fed back from",
             fix="name as many of both: --input NAME=memory_in, --output NAME=memory_out",
         )
     types = infer_types(graph, partial=True)

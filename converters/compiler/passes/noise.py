@@ -106,7 +106,7 @@ def lift_noise(graph: Graph, mode: NoiseMode, inputs: Collection[str] = ()) -> G
         shape = types[node.name].shape
         if shape is None:
             raise UnsupportedOpError(
-                f"cannot lift the noise of {node.name!r}: its shape is not known before the graph runs",
+                f"cannot make an input of the noise of {node.name!r}: its shape is not known before the graph runs",
                 issues=[(node.name, node.op)],
                 why="an input needs a number of axes",
                 fix="use --noise keep or --noise zero",

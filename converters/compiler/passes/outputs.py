@@ -49,7 +49,7 @@ def _check_no_chance(graph: Graph, reference: str, name: str) -> None:
     if samplers:
         raise SignatureError(
             f"{name} would be another one in every run: it depends on {samplers[0].name!r} ({samplers[0].op})",
-            why="no value of such a draw stands for no chance, as 0 does for N(0, 1)",
+            why="no value of such a draw means no chance, as 0 does for N(0, 1)",
             fix="give the tensor before the draw as the action: --output NAME=action",
         )
 

@@ -300,7 +300,7 @@ def _known_shape(node: Node) -> tuple[int | None, ...]:
     if node.dims is None:
         raise SignatureError(
             f"the shape of input {node.name!r} is not known",
-            why="the file does not say it, and nothing that reads it tells",
+            why="the file does not say it, and nothing that reads it says it",
             fix=f"if it has one value for all runs, give it: --set {node.name}=VALUE",
         )
     return node.dims

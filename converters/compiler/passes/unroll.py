@@ -87,7 +87,7 @@ class _Unroller:
             if node.name in self.frames:  # loop bodies are made on demand, once per turn
                 if node.name not in read:  # an output
                     raise _malformed_loop(
-                        node, f"the output {node.origin!r} lies inside it, which no Exit leads out of"
+                        node, f"the output {node.origin!r} is inside it, and no Exit leads out of there"
                     )
                 continue
             try:
@@ -95,7 +95,7 @@ class _Unroller:
             except _DeadError:
                 if node.name not in read:  # an output
                     raise GraphError(
-                        f"the output {node.origin!r} lies on the side of a branch that is not taken",
+                        f"the output {node.origin!r} is on the side of a branch that is not taken",
                         fix="the graph is damaged; freeze it again from its checkpoint",
                     ) from None
         return self.editor.graph()

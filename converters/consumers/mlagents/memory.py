@@ -23,7 +23,7 @@ from export_model.signatures.spec import Memory, TensorSpec
 #: Of a file with both actions, whose memory can carry one: in a note, in ``inspect --unity`` and in ``snippets``.
 DRAWN_KEPT = (
     "the memory keeps the drawn action, and with Deterministic Inference on the other one is played: the next step "
-    "is told another last action than the one that was taken (5 to 20 of 160 decisions differed); export with "
+    "is fed another last action than the one that was taken (5 to 20 of 160 decisions differed); export with "
     "--deterministic for that"
 )
 

@@ -91,7 +91,7 @@ def _by_barracuda(file: OnnxFile) -> Iterator[Thrown]:
         if len(file.shapes.get(layer, ())) > MOST_AXES:
             yield Thrown(
                 "ArgumentOutOfRangeException",
-                "the shapes of a tensor of more than four axes are not told (seen of an attention over entities)",
+                "the shapes of a tensor of more than four axes are not known (seen of an attention over entities)",
                 f"node {layer} ({node.op_type})",
                 "write a .nn, or export for a later consumer",
                 worded=False,
@@ -177,7 +177,7 @@ def _by_sentis(file: OnnxFile, consumer: Consumer) -> Iterator[Thrown]:
                 "give it out through an Identity",
             )
         if consumer.trips_on_reshape and _identity_of_reshaped_output(file, name):
-            thrown = null_reference(f"output {name}", f"give it a producer of its own; --for {consumer.profile} does")
+            thrown = null_reference(f"output {name}", f"give it its own producer; --for {consumer.profile} does")
             yield thrown
 
 

@@ -91,7 +91,7 @@ def _inputs(scene: Scene, player: ReleasePlayer) -> Iterator[PlayEvent]:
                 PlayOutcome.FIRST,
                 f"no sensor of the agent and nothing in ML-Agents feeds {port.name}",
                 f"input {port.name}",
-                "give the agent the sensor it stands for, rename it, or fix it with --set NAME=VALUE",
+                "give the agent its sensor, rename the input, or fix it with --set NAME=VALUE",
                 UNKNOWN.format(name=port.name),
                 "unknown_input, obs_extra, obs_v2_name",
             )

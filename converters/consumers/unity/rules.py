@@ -279,7 +279,7 @@ def _shapes(model: CheckedModel, brain: Brain, testers: dict[str, Tester], spare
             yield warning(
                 f"Model contains an unexpected input named : {view.name}",
                 f"input {view.name}",
-                "nothing feeds it: give the agent the sensor it stands for, rename it, or fix it with --set NAME=VALUE",
+                "nothing feeds it: give the agent its sensor, rename the input, or fix it with --set NAME=VALUE",
             )
 
 

@@ -170,5 +170,5 @@ def one_hot(b: LayerBuilder, args: Sequence[NnValue]) -> NnValue:
         return b.as_shape(turned, (n, 1, depth, count))
     raise b.unsupported_error(
         f"indices of shape {list(x.shape)}, rank {b.layer.axis}",
-        "where the new axis stands was changed between versions of Barracuda; ranks 1 and 2 are known for sure",
+        "versions of Barracuda put the new axis in different places; only ranks 1 and 2 are certain",
     )

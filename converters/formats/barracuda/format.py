@@ -190,7 +190,7 @@ class _Parser:
         if version >= ALIGNED:
             self._what, padding = "the padding before the weights", ALIGNMENT - self._at % ALIGNMENT
             if any(self._take(padding)):
-                raise self._error("the padding before the weights is not zero", "what stands there is not known")
+                raise self._error("the padding before the weights is not zero", "its content is not known")
         weights = self._weights(layers, half)
         trailer = self._trailer(version) if self._at < len(self._data) else None
         if self._at != len(self._data):
@@ -253,7 +253,7 @@ class _Parser:
                 )
             if dataset.offset < 0 or dataset.offset + dataset.length > total:
                 raise self._error(
-                    f"it lies at {dataset.offset} to {dataset.offset + dataset.length}",
+                    f"it is at {dataset.offset} to {dataset.offset + dataset.length}",
                     f"the weights have {total} elements",
                 )
             if dataset.item_size not in ((4, 2) if half else (4,)):

@@ -198,7 +198,7 @@ class _Reader:
         if name not in self.values:
             raise DamagedFileError(
                 f"{reader} reads {name!r}, which must be an input or made by a layer before it",
-                why="the layers of a .nn stand in the order in which they run",
+                why="the layers of a .nn must be in the order in which they run",
                 fix="convert the model again: the frozen_graph_def.pb beside the .nn is exported in its place",
             )
         return self.values[name]

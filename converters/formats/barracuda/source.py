@@ -55,7 +55,7 @@ def _memory_layout(model: NnModel) -> tuple[str, ...]:
 
 
 def _notes(model: NnModel) -> list[str]:
-    notes = ["no runtime but Unity's reads a .nn: the verdict on the export is that its formats are self-consistent"]
+    notes = ["no runtime but Unity's reads a .nn: its formats are compared with each other only (self-consistent)"]
     if model.trailer is not None and model.trailer.producer not in ("", "Script", PRODUCER):
         notes.append(f"Unity wrote this .nn from a model of {model.trailer.producer}")
     if model.half:

@@ -132,7 +132,7 @@ class Bundle(Struct, frozen=True):
             raise BundleError(
                 f"names a file outside the bundle: {relative}",
                 where=str(self.folder / POLICY),
-                why="a bundle's files lie in its folder",
+                why="a bundle's files are in its folder",
                 fix=f"do not use this bundle; {_AGAIN}, or where the links are your own, give what cp -rL copies",
             )
         try:  # the size first: a file may be of any, and policy.json says which

@@ -24,7 +24,7 @@ from export_model.converters.policy.brains import depends_on_input, find_brains
 from export_model.signatures.errors import DamagedFileError, ExportModelError, NotAPolicyError
 from export_model.signatures.roles import CONSTANT_NAMES
 
-_IN_A_CHECKPOINT = "it is the graph that training started from; the values are in a checkpoint, and none lies beside it"
+_IN_A_CHECKPOINT = "it is the graph that training started from; the values are in a checkpoint, and none is next to it"
 _GIVE_THAT = "give the checkpoint (model-<step>.cptk.index), or the frozen graph that training wrote when it ended"
 
 

@@ -168,20 +168,20 @@ class Checkpoint:
 
     def _raw(self, name: str, entry: Any) -> bytes:
         if not 0 <= entry.shard_id < self._header.num_shards:
-            raise self._damaged_error(f"{name!r} lies in shard {entry.shard_id} of {self._header.num_shards}")
+            raise self._damaged_error(f"{name!r} is in shard {entry.shard_id} of {self._header.num_shards}")
         shard = self._shard(entry.shard_id)
         if not shard.exists() and not shard.is_symlink():
             raise SourceError(
                 "is missing",
                 where=shard.name,
-                why="the values of a checkpoint lie in its .data files, the .index only says where",
+                why="the values of a checkpoint are in its .data files, the .index only says where",
                 fix="put the .data file beside the .index, or take a checkpoint that has both: --step N",
             )
         with open_regular_file(shard, MAX_WEIGHTS) as file:
             held = os.fstat(file.fileno()).st_size
             if entry.offset < 0 or entry.size < 0 or entry.offset + entry.size > held:
                 raise DamagedFileError(
-                    f"{name!r} lies beyond the end of the file",
+                    f"{name!r} is beyond the end of the file",
                     where=shard.name,
                     why=f"{entry.size} bytes from {entry.offset} on are not in a file of {held}: it was cut off",
                     fix=_FIX,

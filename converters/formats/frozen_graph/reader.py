@@ -46,8 +46,8 @@ def from_graph_def(graph_def: Any, detached: Detached | None = None) -> Graph:
     if lacks_values(graph_def):
         raise DamagedFileError(
             "the graph's constants hold no values",
-            why="they were taken out, as TensorFlow.js before 1.0 did: those of a tensorflowjs_model.pb lie in shards "
-            "beside it, and weights_manifest.json says where",
+            why="they were taken out, as TensorFlow.js before 1.0 did: those of a tensorflowjs_model.pb are in shards "
+            "next to it, and weights_manifest.json says where",
             fix="give the folder with all of them, or freeze the graph again",
         )
     for node in nodes:

@@ -39,7 +39,7 @@ def stored_in(path: Path) -> Stored:
     """What an ``.h5`` or ``.keras`` holds. Raises RuntimeUnavailableError without h5py, DamagedFileError."""
     if module_origin("h5py") is None:
         raise RuntimeUnavailableError(
-            "is a Keras model, whose weights lie in HDF5, and h5py is not installed",
+            "is a Keras model with its weights in HDF5, and h5py is not installed",
             why="HDF5 is read by its own library",
             fix="pip install 'export-model[keras]'",
         )

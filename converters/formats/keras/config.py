@@ -106,18 +106,18 @@ def no_configuration(names: Sequence[str] = ()) -> SourceError:
 
 
 def _refuse_links(group: Any, h5py: Any, depth: int = 0) -> None:
-    """Raise DamagedFileError where a group of an HDF5 file holds what lies in another file."""
+    """Raise DamagedFileError where a group of an HDF5 file holds what is in another file."""
     for key in group:
         link = group.get(key, getlink=True)
         if isinstance(link, h5py.ExternalLink) or depth > _MAX_DEPTH:
-            raise DamagedFileError(f"its {key!r} lies in another file", fix="save the model again, in one file")
+            raise DamagedFileError(f"its {key!r} is in another file", fix="save the model again, in one file")
         if isinstance(link, h5py.SoftLink):
             continue
         value = group[key]
         if isinstance(value, h5py.Group):
             _refuse_links(value, h5py, depth + 1)
         elif getattr(value, "external", None):
-            raise DamagedFileError(f"its {key!r} lies in another file", fix="save the model again, in one file")
+            raise DamagedFileError(f"its {key!r} is in another file", fix="save the model again, in one file")
 
 
 def stateful_layer(config: Any) -> str | None:

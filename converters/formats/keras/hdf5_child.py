@@ -133,7 +133,7 @@ class _Weights:
         """A dataset that lies in the file as it is; raises DamagedFileError."""
         if not isinstance(data, self.h5py.Dataset) or data.is_virtual or data.external:
             raise DamagedFileError(
-                f"its {str(getattr(data, 'name', ''))[:200]!r} lies in another file, or is not an array"
+                f"its {str(getattr(data, 'name', ''))[:200]!r} is in another file, or is not an array"
             )
         size = _size(data.shape, data.dtype)
         if (

@@ -198,7 +198,7 @@ class _TableReader:
 
     def _span(self, at: int, size: int) -> memoryview:
         if at < 0 or size > len(self.data) - at:
-            raise self._damaged(f"{size} bytes are said to stand at byte {at}, and the file has {len(self.data)}")
+            raise self._damaged(f"{size} bytes are said to be at byte {at}, and the file has {len(self.data)}")
         return self.data[at : at + size]
 
     def _table(self, name: str, at: int) -> Table:
@@ -214,7 +214,7 @@ class _TableReader:
             where = self._number("H", vtable + 4 + 2 * field.slot) if 4 + 2 * field.slot + 2 <= length else 0
             if where:
                 if where < 4 or where + _width(field) > size:
-                    raise self._damaged(f"the field {field.name} is said to stand outside of its table at byte {at}")
+                    raise self._damaged(f"the field {field.name} is said to be outside of its table at byte {at}")
                 self._field(made, field, at + where)
         return made
 

@@ -160,7 +160,7 @@ class Tensors:
         zero = zero if zero.size else np.zeros(1)
         several = scale.size > 1
         if value.dtype.kind not in "iu" or not scale.size or zero.size not in (1, scale.size):
-            raise damaged_error(f"the constant {self.name(number)!r} does not say which floats it stands for")
+            raise damaged_error(f"the constant {self.name(number)!r} does not say which floats it encodes")
         if several and (not 0 <= axis < value.ndim or value.shape[axis] != scale.size):
             raise damaged_error(
                 f"the constant {self.name(number)!r} has {scale.size} scales for another number of channels"

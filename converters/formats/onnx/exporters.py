@@ -182,7 +182,7 @@ FAULTS = (
         name="pool-divisor",
         producer="pytorch",
         op="AveragePool",
-        says="PyTorch's avg_pool2d divides by a number of its own, and the file by the size of the window",
+        says="PyTorch's avg_pool2d divides by divisor_override, and the file by the size of the window",
         ran="torch 2.14.1 with onnxscript 0.6.2 and 0.7.2: all numbers by 4/3 too small with a divisor of 3",
         evidence="reproduced with torch 2.14.1, onnxscript 0.6.2 and 0.7.2",
         shows=_loses_divisor,
@@ -255,11 +255,11 @@ def repair_model(model: Any, name: str | None) -> tuple[str, ...]:
 
 
 def _insert(graph: Any, node: Any, behind: Sequence[Any], name: str) -> None:
-    """Put nodes behind one of a graph. Raises UsageError where it stands in a branch or a loop."""
+    """Put nodes behind one of a graph. Raises UsageError where it is inside a branch or a loop."""
     if not behind:
         return
     place = next((i for i, n in enumerate(graph.node) if n.output[:1] == node.output[:1]), None)
     if place is None:
-        raise UsageError(f"--repair: {name} stands in a branch or a loop", fix="export the model again")
+        raise UsageError(f"--repair: {name} is inside a branch or a loop", fix="export the model again")
     for each in reversed(behind):
         graph.node.insert(place + 1, each)

@@ -122,7 +122,7 @@ def array_of(tensor: Any, detached: Detached | None) -> np.ndarray:
         raise UnsupportedOpError(
             f"the tensor {name!r} has data type {tensor.data_type}, which is not converted",
             issues=[(name, "Constant")],
-            why="policies compute in float32; half precision, quantised numbers and strings stand in no op table here",
+            why="policies compute in float32; half precision, quantised numbers and strings are not supported",
             fix="export the model in float32, without quantisation",
         )
     dtype, field = _STORED[tensor.data_type]
@@ -281,7 +281,7 @@ def _bring(
         offset = int(entries.get("offset") or 0)
         length = int(entries.get("length") or len(data) - offset)
     except ValueError as error:
-        raise _damaged_error(tensor.name, f"it says to lie at {entries}") from error
+        raise _damaged_error(tensor.name, f"it says to be at {entries}") from error
     if offset < 0 or length < 0 or offset + length > len(data):
         raise _damaged_error(tensor.name, f"{path.name} has {len(data)} bytes, it wants {length} from {offset} on")
     if detached is None or length < LARGE:
@@ -298,7 +298,7 @@ def _inside(folder: Path, location: str, name: str) -> Path:
     path = fetch.inside(folder, location) if location and "\0" not in location else None
     if path is None or path == folder.resolve():
         raise DamagedFileError(
-            f"the weights of {name!r} are said to lie in {location!r}, outside the model's folder",
+            f"the weights of {name!r} are said to be in {location!r}, outside the model's folder",
             why="a model file is untrusted: nothing else of this machine is read for it",
             fix="put the file beside the model (cp -L where it is a link) and export the model again",
         )

@@ -108,7 +108,7 @@ def _of_torch(model: OnnxModel, facts: SourceFacts, version: int) -> SourceFacts
         else:
             notes.append("continuous_actions is the same as action; it is exported once")
     if "action" in outputs and "discrete_actions" in outputs:
-        notes.append("discrete_actions stands for the same as action; it is exported once")
+        notes.append("discrete_actions is the same as action; it is exported once")
     raw = outputs.get("deterministic_continuous_actions")
     if raw is not None and "continuous_actions" in outputs and _is_squashed(model.graph, outputs["continuous_actions"]):
         notes.append(SAC_MEAN)

@@ -53,7 +53,7 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
     if not files[1].is_file():
         raise SourceError(
             f"its {_ARGUMENTS} is missing",
-            why=f"{_STATE} has weights; which activations, memory and actions they belong to stands beside it",
+            why=f"{_STATE} has weights only; activations, memory and actions are recorded in the files next to it",
             fix="give the folder as RLlib wrote it",
         )
     state, arguments = (unpickle_objects(given.bytes_of(file)) for file in files)

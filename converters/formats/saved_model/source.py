@@ -28,7 +28,7 @@ from export_model.signatures.errors import NotAPolicyError
 
 FILE = "saved_model.pb"
 _WITHOUT_VARIABLES = (
-    f"the values of a SavedModel are in the folder variables/, which does not lie beside its {FILE}",
+    f"the values of a SavedModel are in the folder variables/, which is not next to its {FILE}",
     f"give the whole folder as it was saved: {FILE}, variables/",
 )
 

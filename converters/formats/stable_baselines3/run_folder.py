@@ -71,7 +71,7 @@ def _ambiguity_error(files: Sequence[Path], place: str) -> SourceError:
     named = [(file.name, f"--normaliser {path_text(file)}") for file in files[:8]]
     return SourceError(
         f"its observations may have been normalised by {' or '.join(name for name, _ in named)}",
-        why=f"statistics of VecNormalize lie {place}, and their names do not say that they are of this model",
+        why=f"statistics of VecNormalize are {place}, and their names do not say that they are of this model",
         fix=f"say which: {' or '.join(flag for _, flag in named)}; none: --set normaliser=none",
     )
 

@@ -171,7 +171,7 @@ def _weights(
             stored, shape = _stored_type(entry)
             size = math.prod(shape) * stored.itemsize
             if size > len(data) - at:
-                raise _damaged_error(f"the weight {entry['name']!r} lies beyond the end of its files")
+                raise _damaged_error(f"the weight {entry['name']!r} is beyond the end of its files")
             raw = np.frombuffer(data, stored.newbyteorder("<"), math.prod(shape), at)
             found[entry["name"]] = _dequantise(raw.astype(stored), entry).reshape(shape)
             at += size
@@ -188,7 +188,7 @@ def shard(folder: Path, name: str) -> Path:
         raise SourceError(
             f"names the weights {name[:120]!r}",
             where=MODEL,
-            why="the weights of a model lie in its own folder; nothing else is read",
+            why="the weights of a model must be in its folder; nothing else is read",
             fix="put the .bin files beside model.json (cp -rL where they are links), and their bare names into "
             "weightsManifest",
         )

@@ -255,7 +255,7 @@ class Machine:
         if isinstance(value, float):
             return self.b.const(np.array(value, FLOAT32))
         raise UnsupportedOpError(
-            f"a {type(value).__name__} stands where a tensor is expected", why="it must be a number"
+            f"a {type(value).__name__} is given where a tensor is expected", why="it must be a number"
         )
 
     def pair(self, left: Any, right: Any) -> tuple[str, str]:
@@ -301,5 +301,5 @@ class Machine:
 def unknown_length() -> SourceError:
     """Return the refusal of a program that does not say how long an input is."""
     return SourceError(
-        "how many numbers it observes is not told by its code", why="a scripted module takes any", fix=_TELL
+        "its code does not say how many numbers it observes", why="a scripted module takes any", fix=_TELL
     )

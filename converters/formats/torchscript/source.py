@@ -204,8 +204,8 @@ def _model(
         memory_layout=tuple(parts) if all(parts) else (),
         outputs={**roles, **({MEMORY_OUT: Role.MEMORY_OUT} if memory else {})},
         notes=(
-            "no runtime but PyTorch runs it: unless --trust-source --verify torch does, the verdict on it is that "
-            "its formats are self-consistent",
+            "no runtime but PyTorch runs it: unless --trust-source --verify torch does, its "
+            "formats are compared with each other only (self-consistent)",
             *([DOUBLES_NARROWED] if machine.narrowed else []),
             *([_memory_note(machine, inside)] if inside else []),
             *([f"its states {', '.join(states)} are one row for each agent: {MEMORY_IN}"] if states else []),

@@ -55,7 +55,7 @@ class TensorView(ScriptTensor):
         """Put another tensor where it lies. Raises UnsupportedOpError where that cannot be told."""
         if self._put is None:
             raise UnsupportedOpError(
-                "it writes to a view of a tensor", why="where this view lies in the whole is not followed"
+                "it writes to a view of a tensor", why="where this view is in the whole is not followed"
             )
         self._whole.write(self._put(self._whole.read(), reference))
         self._reference, self.version = reference, self._whole_version()

@@ -100,7 +100,7 @@ def _table() -> Mapping[str, OpDef]:
     for module in (*numbers, arrays, joining, slicing, filling, places, older, blocks, transposed):
         for op in module.OPS:
             if op.name in table:
-                raise ValueError(f"op {op.name} stands twice in the table")
+                raise ValueError(f"op {op.name} is in the table twice")
             table[op.name] = op
     return table
 
@@ -169,6 +169,6 @@ def unsupported_error(nodes: Iterable[Node]) -> UnsupportedOpError:
         why = "a loop or branch is left whose number of steps or condition is not known before the graph runs"
         fix = "give the placeholder that decides it a value: --set NAME=VALUE (sequence_length is set to 1 by itself)"
     else:
-        why = "no kernel, shape rule and ONNX lowering stand in the op table for it"
+        why = "this op is not supported yet"
         fix = "if the op is not part of the policy, name the outputs you need with --output; else please open an issue"
     return UnsupportedOpError(f"cannot convert {shown}{more}", issues=issues, why=why, fix=fix)

@@ -43,7 +43,7 @@ def find_bound(state: State, given: Fetched, module: str) -> Bound:
         return Bound(squashed, (f"{beside.name}, beside it, says that {bound} bounds its action",), (beside,))
     if trainer is not None:
         raise SourceError(
-            "the checkpoint does not tell what bounds its continuous action: a clip, or tanh",
+            "the checkpoint does not say what bounds its continuous action: a clip, or tanh",
             why=f"its optimizers ({', '.join(_optimizers(state))}) and its deviation are of different trainers; "
             "a plugin may have trained it",
             fix=LET_IT_EXPORT,

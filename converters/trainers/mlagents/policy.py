@@ -181,8 +181,8 @@ def _notes(generation: _Generation, sensors: Sequence[SensorInput], joined: bool
     if vectors and (joined or (not generation.by_sensor and (len(vectors) > 1 or len(generation.lists) > 1))):
         size = sum(s.shape[0] for s in vectors)
         notes.append(
-            f"the checkpoint does not tell how many vector sensors the {size} numbers come from; they are one input, "
-            "in the order of the sensors; --sensors, a shape for each, gives each an input of its own"
+            f"the checkpoint does not say how many vector sensors the {size} numbers come from; they are one input, "
+            "in the order of the sensors; --sensors, a shape for each, makes an input of each"
         )
     return notes
 

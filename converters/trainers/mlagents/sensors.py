@@ -131,7 +131,7 @@ _LAYOUTS: tuple[Rule[Layout, str], ...] = (
     Rule(
         _ONE_VECTOR,
         lambda s: not s.images and not s.known,
-        "no sensor has weights of its own, so that the first layer takes vectors alone",
+        "no sensor has its own weights, so that the first layer takes vectors alone",
     ),
     Rule(
         _BESIDE_IMAGES,
@@ -162,7 +162,7 @@ def find_sensors(
     if lengths:
         sizes = ", ".join(str(n) for n in lengths.values())
         raise SourceError(
-            "the checkpoint does not tell how many entities the agent's lists have at most",
+            "the checkpoint does not say how many entities the agent's lists have at most",
             why=f"it attends to entities of {sizes} numbers (BufferSensor), any number of them",
             fix=f"{_SAY} 8 for a vector, 3x84x84 for an image, 20x{next(iter(lengths.values()))} for a list of at "
             "most 20 entities",
@@ -206,9 +206,9 @@ def _arrange(state: Weights, layout: Layout, width: int) -> tuple[list[SensorInp
     rule, rest = first(_LAYOUTS, layout), layout.rest
     if rule is None:
         raise SourceError(
-            "the checkpoint does not tell the agent's sensors",
-            why=f"{rest} of the {width} columns of its first layer belong to vectors that leave no trace, and images "
-            "stand between them",
+            "the checkpoint does not say which sensors the agent has",
+            why=f"{rest} of the {width} columns of its first layer belong to vectors that leave no trace, with "
+            "images between them",
             fix=f"{_SAY} 8 for a vector and 3x84x84 for an image; or {LET_IT_EXPORT}",
         )
     seen = [_told_by_weights(state, m) for m in layout.known]
@@ -245,7 +245,7 @@ def find_goals(
     if len(fitting) == 1:
         return fitting[0]
     raise SourceError(
-        "the checkpoint does not tell which of the agent's sensors is its goal",
+        "the checkpoint does not say which of the agent's sensors is its goal",
         why=f"the goals have {width} of the numbers that it observes"
         + (f", and several sensors may have them ({given})" if fitting else ""),
         fix=f"{_SAY} 8 for a vector and 3x84x84 for an image, goal: before a goal (8,goal:{width})",
@@ -298,7 +298,7 @@ def _told_by_weights(state: Weights, module: str) -> SensorInput:
     example = squares[0] if squares else sizes[0] if sizes else (3, 84, 84)
     shown = ", ".join("x".join(map(str, s)) for s in (squares or sizes)[:8])
     raise SourceError(
-        f"the checkpoint does not tell the size of the image that {module} sees",
+        f"the checkpoint does not say the size of the image that {module} sees",
         why=f"{says} ({encoder.key}), which ends in {columns} numbers, and {len(sizes)} sizes give that"
         + (f"; {'square ones' if squares else 'some'}: {shown}" if shown else ""),
         fix=f"{_SAY} 8 for a vector and {'x'.join(map(str, example))} for an image; or {LET_IT_EXPORT}",

@@ -56,7 +56,7 @@ class Weights:
         """The shape of a tensor; raises DamagedFileError where there is none of that name."""
         if name not in self._tensors:
             raise self.damaged_error(
-                f"{self._holder} has no {name}", "what stands beside it belongs to a network that has one"
+                f"{self._holder} has no {name}", "the other weights belong to a network that has one"
             )
         return self._tensors[name].shape
 
@@ -124,6 +124,6 @@ class Weights:
 def pytorch_alone(maker: str, what: str = "it") -> str:
     """The note on a file that nothing runs which a verification could ask."""
     return (
-        f"no runtime but PyTorch with {maker} reads {what}: unless --verify torch builds its network, the verdict on "
-        "the export is that its formats are self-consistent"
+        f"no runtime but PyTorch with {maker} reads {what}: unless --verify torch builds its network, its "
+        "formats are compared with each other only (self-consistent)"
     )

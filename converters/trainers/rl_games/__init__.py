@@ -47,7 +47,7 @@ def _rebuild(saved: Saved, states: dict[str, Mapping[Any, Any]]) -> Rebuilt:
         "rl_games",
         _FILES,
         _KEYS,
-        why="which activations, memory and deviation they belong to stands in the settings of its run",
+        why="activations, memory and deviation are recorded only in the run's settings",
         fix="put the run's params/agent.yaml (Isaac Lab) or config.yaml next to the checkpoint, or give the .pth "
         "where the run left it",
     )

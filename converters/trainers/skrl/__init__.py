@@ -33,9 +33,9 @@ def _rebuild(saved: Saved, state: dict[Any, Any]) -> Rebuilt:
         "skrl",
         _FILES,
         ("models",),
-        why="which layers and activations they belong to stands in the settings of its run (models)",
-        fix="put the run's params/agent.yaml next to the checkpoint; a model that is a class of its own "
-        "is exported there (torch.onnx.export), and the .onnx given",
+        why="layers and activations are recorded only in the run's settings (models)",
+        fix="put the run's params/agent.yaml next to the checkpoint; a model of a custom class: "
+        "export it there (torch.onnx.export), and give the .onnx",
     )
     graph, facts = rebuild_policy(saved, state, settings)
     return Rebuilt(graph, facts, (file,))

@@ -150,7 +150,7 @@ def _family(data: Mapping[str, Any]) -> _Family:
     module = entry.get("__module__") if isinstance(entry, dict) else None
     found = _FAMILIES.get(module) if isinstance(module, str) else None
     if found is None:
-        said = f"its class is of {module[:80]}" if isinstance(module, str) else "its class is not told"
+        said = f"its class is of {module[:80]}" if isinstance(module, str) else "its class is not known"
         raise SourceError(
             "its policy is none that is built here",
             why=f"{said}; what a class of one's own computes is not in the file. Policies of PPO, A2C, TRPO, SAC, TD3, "
@@ -400,7 +400,7 @@ def _continuous(made: _Built, mean: str, spread: str | None) -> None:
     else:
         value = clip(net, value, _limit(net, low, "low"), _limit(net, high, "high"))
     if len(made.actions.shape) > 1:
-        made.notes.append(f"its actions are {made.actions.shape} in the environment; here they stand in one row")
+        made.notes.append(f"its actions are {made.actions.shape} in the environment; here they are one row")
     net.output("action", value)
     made.outputs["action"] = Role.ACTION
 

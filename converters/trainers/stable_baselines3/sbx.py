@@ -139,7 +139,7 @@ def _activation_of(module: Instance) -> str:
     )
     if name not in _ACTIVATIONS:
         raise SourceError(
-            f"its activation is {str(name)[:60] or 'not told'}",
+            f"its activation is {str(name)[:60] or 'not known'}",
             why=f"of jax.nn's functions {', '.join(_ACTIVATIONS)} are known to be what PyTorch's are",
             fix=_EXPORT_ONNX,
         )

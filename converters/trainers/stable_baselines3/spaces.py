@@ -57,7 +57,7 @@ class Space(Struct, frozen=True):
                 numbers = np.array([float(n) for n in _NUMBER.findall(text)], np.float32)
             if len(numbers) not in (1, self.size) or "..." in text:
                 raise SourceError(
-                    f"the bounds of its {self.size} actions are not told",
+                    f"the bounds of its {self.size} actions are not known",
                     why="the text of so many numbers leaves out the middle",
                     fix="export the model to ONNX in its own project (torch.onnx.export), and give that",
                 )

@@ -77,7 +77,7 @@ def activation_of(step: Step, spec: Any) -> Activation:
     if isinstance(spec, Mapping):
         inner = layer_of(spec)
         if inner.kind not in LAYERS:
-            raise UnsupportedOpError(f"its activation is {(inner.name or inner.kind)[:80]!r}, a function of its own")
+            raise UnsupportedOpError(f"its activation is {(inner.name or inner.kind)[:80]!r}, a custom function")
         return lambda b, x: str(LAYERS[inner.kind](step.inner(inner, [x], ())))
     name = {"logSoftmax": "log_softmax", "hardSigmoid": "hard_sigmoid"}.get(spec, spec)
     if name == "hard_sigmoid" and not step.is_keras_3:

@@ -178,7 +178,7 @@ def _bidirectional(step: Step) -> list[str]:
     forward = layer_of(step.get("layer"))
     backward = layer_of(step.get("backward_layer") or step.get("layer"))
     if forward.kind not in LAYERS or forward.config.get("return_state") or len(step.tensors) > 1:
-        raise UnsupportedOpError(f"it wraps a {forward.kind} with states of its own")
+        raise UnsupportedOpError(f"it wraps a {forward.kind} with its own states")
     turned: dict[str, Any] = {**backward.config}
     if not step.get("backward_layer"):
         turned["go_backwards"] = not forward.config.get("go_backwards")

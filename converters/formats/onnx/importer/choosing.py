@@ -96,7 +96,7 @@ def _gather_nd(op: Op, net: Importer) -> str:
         lengths = [net.length(x, batch + i) for i in range(count)]
         flat = _flat(net, indices, lengths)
         if net.dtype(x) == BOOL or rest:
-            raise op.op_error("it gathers parts of each row by indices of its own")
+            raise op.op_error("it gathers parts of each row by that row's indices")
         table = net.reshape(x, (*dims[:batch], int(np.prod(lengths))))
         chosen = net.reshape(flat, (*places[:batch], int(np.prod([_number(op, d) for d in places[batch:-1]] or [1]))))
         return net.reshape(nn.gather_elements(net, table, chosen), (*places[:-1],))

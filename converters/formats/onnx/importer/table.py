@@ -30,7 +30,7 @@ def _table() -> Mapping[tuple[str, str], Translate]:
     for module in _MODULES:
         for kind, function in module.OPS.items():
             if ("", kind) in table:
-                raise ValueError(f"{kind} stands twice in the table")
+                raise ValueError(f"{kind} is in the table twice")
             table["", kind] = function
     return table
 

@@ -27,7 +27,7 @@ def _view(x: ScriptTensor, show: Show, put: Put | None = None) -> ScriptTensor:
 
 def _tensor(x: Any) -> ScriptTensor:
     if not isinstance(x, ScriptTensor):
-        raise UnsupportedOpError(f"a {type(x).__name__} stands where a tensor is expected", why="it has no axes")
+        raise UnsupportedOpError(f"a {type(x).__name__} is given where a tensor is expected", why="it has no axes")
     return x
 
 

@@ -29,7 +29,7 @@ def _table() -> Mapping[str, Translate]:
         for name, function in module.OPS.items():
             dotted = name if "." in name or name in scalars.BARE else f"torch.{name}"
             if dotted in table:
-                raise ValueError(f"{dotted} stands twice in the table")
+                raise ValueError(f"{dotted} is in the table twice")
             table[dotted] = function
     return table
 

@@ -400,7 +400,7 @@ def pad(b: NnBuilder, args: Sequence[Value]) -> Value:
         if (low, high) == (0, 0):
             continue
         if min(low, high) < 0 or value.shape[axis] == BATCH:
-            raise b.nn_error(f"a border of {low} and {high} on axis {axis}", "borders lie around the image")
+            raise b.nn_error(f"a border of {low} and {high} on axis {axis}", "borders are around the image")
         if place in (H, W) and len(shape) == 4:
             edges[place] = (low, high)
             continue
