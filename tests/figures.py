@@ -245,7 +245,7 @@ def page(content: Mapping[str, Any]) -> str:
         "passed by what float32 rounding was measured to explain.",
         "",
         *_table(
-            ["format", "runtime", "elements", "equal", "below 1e-6", "below 1e-5", "above", "by rounding"],
+            ["format", "runtime", "elements", "equal/below 1e-6/below 1e-5/above", "by rounding"],
             _by_runtime([f, r, *_spread([cells[k, f, r] for k in kinds if (k, f, r) in cells])] for f, r in rows),
         ),
         "## Draws",
@@ -379,7 +379,7 @@ def _spread(found: Sequence[Mapping[str, Any]]) -> list[object]:
     below = [sum(n for d, n in counts.items() if 0 < d < edge) for edge in (0.99e-6, 0.99e-5)]
     equal, above = counts[0.0], total - counts[0.0] - below[1]
     share = [f"{n / total:.3%}" if n else "0" for n in (equal, below[0], below[1] - below[0], above)]
-    return [f"{total:,}", *share, sum(c["rounding"] for c in found)]
+    return [f"{total:,}", "/".join(share), sum(c["rounding"] for c in found)]
 
 
 def main() -> int:
