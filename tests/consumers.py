@@ -12,14 +12,13 @@ TITLE = "Unity's importers"
 HEAD = f"""\
 ## {TITLE}
 
-Barracuda, Sentis and the Inference Engine do not read every ONNX as the operators are defined. 352 small models, one
-construct each, were run in each importer outside the Editor, and 87 more in the players of ML-Agents
-([what they do](tasks/unity-checker.md)). What is not listed is read rightly, if it was among these. The exceptions,
-fixes and models of evidence are in the program:
+What these importers read otherwise than the operators are defined: 352 small models, one construct each, were run in
+each importer outside the Editor, and 87 more in the players of ML-Agents ([what they do](tasks/unity-checker.md)). What
+is not listed is read rightly, if it was among these. The program has the exceptions, fixes and models of evidence:
 
 ```sh
 export-model consumers "Barracuda 2.0.0"        # what one importer misreads
-export-model consumers --json > consumers.json  # everything, with exceptions, fixes and evidence
+export-model consumers --json > consumers.json  # everything
 ```
 
 `--for` writes a policy without any of it; [`inspect --unity`](tasks/unity-checker.md) finds it in a file. *wrong*:
