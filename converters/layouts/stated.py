@@ -76,11 +76,12 @@ def _joints(
             joints = tuple(own.get(_plain(name), "") for name in named)
             if set(joints) == set(robot.joints):
                 yield robot, joints
-        elif len(places) == actions and set(places) == set(range(actions)):
-            for order in (robot.joints, *robot.orders.values()):
-                yield robot, tuple(order[int(place)] for place in places)
-        else:
+        elif not places:
             yield robot, robot.joints
+        elif len({*places}) == len(places) == actions:
+            ranks = sorted(places)  # slots of a robot that may have more joints, in its own order
+            for order in (robot.joints, *robot.orders.values()):
+                yield robot, tuple(order[ranks.index(place)] for place in places)
 
 
 def _plain(name: str) -> str:

@@ -242,6 +242,11 @@ def test_a_deploy_yaml_of_any_name_is_one(tmp_path: Path) -> None:
     for name in ("deploy.yaml", "mine.yaml"):
         (tmp_path / name).write_text(json.dumps(right))
         assert export_model("layout", FOLDER / "walker.pt", "--check", tmp_path / name).status == 0
+    slots = [place + 3 * (place > 4) for place in places]  # of a robot that has joints which nothing moves
+    (tmp_path / "mine.yaml").write_text(json.dumps({**right, "joint_ids_map": slots}))
+    assert export_model("layout", FOLDER / "walker.pt", "--check", tmp_path / "mine.yaml").status == 0
+    (tmp_path / "mine.yaml").write_text(json.dumps({**right, "joint_ids_map": [0] * 12}))
+    is_refused(export_model("layout", FOLDER / "walker.pt", "--check", tmp_path / "mine.yaml"), "states no layout")
     (tmp_path / "mine.yaml").write_text(json.dumps({**right, "joint_ids_map": list(range(12))}))
     ran = export_model("layout", FOLDER / "walker.pt", "--robot", "go2", "--check", tmp_path / "mine.yaml")
     assert ran.status == 1
