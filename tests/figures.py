@@ -253,7 +253,7 @@ def page(content: Mapping[str, Any]) -> str:
         "Actions drawn inside the graph are held against their distribution; the false alarm rate is 1e-6 a test. The "
         f"smallest p: {'; '.join(_draws(cells, kinds, rows))}.",
         "",
-        f"**Runtimes.** {', '.join(f'{r} {v}' for r, v in content['runtimes'].items())}.",
+        f"**Runtimes.** {'; '.join(_versions(content['runtimes']))}.",
         "",
         *(_profiles(content["unity"]) if "unity" in content else []),
         *(_litert(content["litert"]) if "litert" in content else []),
@@ -274,6 +274,12 @@ def _draws(
         least = (f"{r} {_number(min(c['least_p'] for c in found))}" for r, found in drawn.items() if found)
         if tests:
             yield f"{format} ({' or '.join(map(str, sorted(tests)))} tests each) {', '.join(least)}"
+
+
+def _versions(runtimes: Mapping[str, str]) -> Iterator[str]:
+    """Each version, behind the runtimes that have it."""
+    for version, of in itertools.groupby(runtimes, lambda name: runtimes[name]):
+        yield f"{', '.join(of)} {version}"
 
 
 def write(content: Mapping[str, Any]) -> None:
