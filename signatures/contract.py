@@ -338,10 +338,12 @@ class Integer(Struct, frozen=True, tag_field="kind", tag="integer"):
     """Whole numbers, both ends included.
 
     - ``low``, ``high``: one for all, or one for each number of the input; None where any integer goes.
+    - ``clipped``: what is higher is taken as ``high``, as a step beyond the end of a motion; missing where it is not.
     """
 
     low: _Id | list[_Id | None] | None = None
     high: _Id | list[_Id | None] | None = None
+    clipped: bool | None = None
 
 
 class Mask(Struct, frozen=True, tag_field="kind", tag="mask"):
@@ -357,6 +359,8 @@ class Mask(Struct, frozen=True, tag_field="kind", tag="mask"):
 
 _Id = Annotated[int, Meta(ge=-(2**31), le=2**31 - 1)]
 Distribution = Normal | Uniform | Integer | Mask
+#: Fields of a distribution that are missing where they are None.
+_OPTIONAL = ("clip", "clipped")
 
 
 def _check_specs(
@@ -411,7 +415,7 @@ def _with_distribution(spec: TensorSpec, place: str) -> TensorSpec:
     if isinstance(found, Integer):
         _check_ids(found, spec.shape[-1] if len(spec.shape) > 1 else 1, place)
     made: dict[str, Any] = to_builtins(found)
-    return replace(spec, distribution={k: v for k, v in made.items() if k != "clip" or v is not None})
+    return replace(spec, distribution={k: v for k, v in made.items() if k not in _OPTIONAL or v is not None})
 
 
 def _check_ids(found: Integer, width: int | None, place: str) -> None:

@@ -1,7 +1,8 @@
 """Integers that an input takes: ids of a table's rows, column by column.
 
 As in policy.json: ``{"kind": "integer", "low": 0, "high": 9}``; a list of each where columns have tables of their own;
-None where a number may be any, as nothing looks it up. Without such an entry nothing is known.
+None where a number may be any, as nothing looks it up; with ``"clipped": true`` higher ones are taken as the highest.
+Without such an entry nothing is known.
 """
 
 from __future__ import annotations
@@ -28,6 +29,11 @@ def id_bounds(spec: TensorSpec) -> tuple[np.ndarray, np.ndarray] | None:
     return low, high
 
 
+def is_clipped(spec: TensorSpec) -> bool:
+    """Whether the policy takes ids beyond the highest as the highest."""
+    return bool((spec.distribution or {}).get("clipped"))
+
+
 def check_ids(spec: TensorSpec, values: np.ndarray) -> None:
     """Raise UsageError unless all of ``values`` [B, …] that are looked up in a table are ids of it."""
     bounds = id_bounds(spec)
@@ -35,7 +41,8 @@ def check_ids(spec: TensorSpec, values: np.ndarray) -> None:
         return
     low, high = (np.broadcast_to(b, values.shape) for b in bounds)
     wide = values.astype(np.float64)
-    wrong = ~((wide >= low) & (wide <= high) & ((wide == np.rint(wide)) | np.isinf(high)))
+    within = (wide >= low) & ((wide <= high) | is_clipped(spec))
+    wrong = ~(within & ((wide == np.rint(wide)) | np.isinf(high)))
     if wrong.any():
         place = tuple(int(i) for i in np.unravel_index(int(wrong.argmax()), wide.shape))
         raise UsageError(
@@ -52,6 +59,6 @@ def bounds_text(spec: TensorSpec) -> str:
     if not np.isfinite(high).any():
         return "integers, of any size"
     if len(high) == 1:
-        return f"an integer from {low[0]:.0f} to {high[0]:.0f}"
+        return f"an integer from {low[0]:.0f} to {high[0]:.0f}{', or beyond' if is_clipped(spec) else ''}"
     shown = [f"{a:.0f} to {b:.0f}" if np.isfinite(b) else "any" for a, b in zip(low[:8], high[:8], strict=True)]
     return f"integers, column by column: {', '.join(shown)}{', …' if len(high) > 8 else ''}"

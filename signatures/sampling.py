@@ -16,7 +16,7 @@ from typing import TypeAlias
 import numpy as np
 from msgspec import Struct
 
-from export_model.signatures.ids import id_bounds
+from export_model.signatures.ids import id_bounds, is_clipped
 from export_model.signatures.masks import all_allowed, forbidden, one_allowed, random_masks
 from export_model.signatures.pictures import structured_images
 from export_model.signatures.roles import OBSERVATIONS, Role
@@ -212,7 +212,8 @@ def _integers(
     low, high = (np.broadcast_to(b, shape) for b in bounds)
     known = np.isfinite(high)
     first, count = np.where(known, low, 0).astype(np.int64), np.where(known, high - low + 1, 1).astype(np.int64)
-    drawn = rng.integers(0, count) if shape else rng.integers(0, int(count))
+    reach = count + count // 4 + 1 if is_clipped(spec) and style is not _each_id else count
+    drawn = rng.integers(0, reach) if shape else rng.integers(0, int(reach))
     if style is _each_id and shape:
         turn = np.arange(shape[0]).reshape(-1, *(1,) * (len(shape) - 1))
         start = rng.integers(0, count[:1])  # the columns are not in step

@@ -23,7 +23,7 @@ def id_distribution(graph: Graph, types: Types, node: Node, *, from_end: bool = 
     An id is what picks a row of a table, sets a number of a one-hot, or is compared with 0, 1, 2 …; it may be cast,
     sliced, shifted and scaled on the way, and counted from the end where it is negative, as the graph itself is asked.
     ``from_end``: the remainder by a table's length that is looked up is the reader's (``SourceFacts``). Integers that
-    nothing looks up may be any.
+    nothing looks up may be any. ``clipped``: the graph itself takes higher ids as the highest, and lower ones not.
     """
     shape = node.dims
     if shape is None:
@@ -39,6 +39,7 @@ def id_distribution(graph: Graph, types: Types, node: Node, *, from_end: bool = 
     if unknown and whole:
         return None
     low, high = np.full(count, -np.inf), np.full(count, np.inf)
+    clipped = False
     for reference, (first, last) in lookups:
         made = _seen_at(graph, node, reference, sizes, [np.zeros(count), np.ones(count), np.arange(count)])
         if made is None:
@@ -52,18 +53,31 @@ def id_distribution(graph: Graph, types: Types, node: Node, *, from_end: bool = 
         edges = np.sort([(first - zero[own]) / scale[own], (last - zero[own]) / scale[own]], axis=0)
         np.maximum.at(low, column[own], np.ceil(edges[0]))
         np.minimum.at(high, column[own], np.floor(edges[1]))
-        # A remainder or a clip is told by what is made of ids at the ends, and beyond.
         known = np.isfinite(high)
-        ends = [np.where(known, bound, 0.0) for bound in (low, high, high + 1)]
+        ends = [np.where(known, bound, 0.0) for bound in (low, high, high + 1, low - 1)]
         seen = _seen_at(graph, node, reference, sizes, ends)
-        if seen is None:
+        linear = [(zero + scale * end[column])[own] for end in ends]
+        clips = _clips([made[own] for made in seen or ()], linear)
+        if clips is None:
             return None
-        for made_of, end in zip(seen, ends, strict=True):
-            if not np.array_equal(made_of[own], (zero + scale * end[column])[own]):
-                return None
+        clipped |= clips
     if not whole and not np.isfinite(high).any():
         return None
-    return _entry(low, high, sizes)
+    return _entry(low, high, sizes, clipped=clipped)
+
+
+def _clips(made: list[np.ndarray], linear: list[np.ndarray]) -> bool | None:
+    """Whether ids beyond the highest are taken as that, on this side alone; None where they are taken otherwise.
+
+    ``made`` of the lowest ids, the highest, and one beyond either, ``linear`` what would be made without a remainder or
+    a clip.
+    """
+    if not made:
+        return None
+    lowest, highest, above, below = (np.array_equal(*pair) for pair in zip(made, linear, strict=True))
+    if lowest and highest and above:
+        return False
+    return True if lowest and highest and below and np.array_equal(made[2], made[1]) else None
 
 
 def _seen_at(
@@ -90,17 +104,18 @@ def _seen_at(
     return [np.asarray(each, np.float64).reshape(-1) for each in made]
 
 
-def _entry(low: np.ndarray, high: np.ndarray, sizes: list[int]) -> dict[str, object] | None:
-    """Bounds as policy.json says them: one pair, or one for each number of the last axis."""
-    if (low > high).any():
+def _entry(low: np.ndarray, high: np.ndarray, sizes: list[int], *, clipped: bool) -> dict[str, object] | None:
+    """Bounds as policy.json says them: one pair, or one for each number of the last axis; None where some clip."""
+    if (low > high).any() or (clipped and not np.isfinite(high).all()):
         return None
+    more = {"clipped": True} if clipped else {}
     rows = [bound.reshape(-1, sizes[-1] if len(sizes) > 1 else 1) for bound in (low, high)]
     if any((row != row[:1]).any() for row in rows):
         return None
     pairs = [[None if not np.isfinite(n) else int(n) for n in row[0]] for row in rows]
     if all(len({*values}) == 1 for values in pairs):
-        return {"kind": "integer", "low": pairs[0][0], "high": pairs[1][0]}
-    return {"kind": "integer", "low": pairs[0], "high": pairs[1]}
+        return {"kind": "integer", "low": pairs[0][0], "high": pairs[1][0], **more}
+    return {"kind": "integer", "low": pairs[0], "high": pairs[1], **more}
 
 
 def _lookups(graph: Graph, types: Types, node: Node) -> tuple[list[tuple[str, tuple[int, int]]], bool]:
