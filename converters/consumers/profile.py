@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NoReturn
 
 from msgspec import Struct
+from msgspec.structs import replace
 
 from export_model.converters.compiler.options import NoiseMode
-from export_model.converters.formats.format import WriteOptions
+from export_model.converters.files.chunks import Pieces
+from export_model.converters.formats.format import Artifact, WriteOptions
 from export_model.converters.formats.registry import WRITTEN
 from export_model.converters.policy.policy import Policy
 from export_model.signatures.errors import ProfileError
@@ -26,7 +28,7 @@ class Profile(Struct, frozen=True, eq=False, kw_only=True):
     ``code`` is the snippet that says how to use its files. ``loaders`` are those of
     ``converters/consumers/robots/loaders.py`` whose rules the ONNX must meet. ``batch`` is the number of agents that
     the files are for (None: any). ``noise`` is what ``--noise`` may say of files in its names: most feed none, so that
-    the model draws it or has none.
+    the model draws it or has none. ``beside`` gives what the consumer is built with beside the file, by name.
     """
 
     name: str
@@ -43,11 +45,19 @@ class Profile(Struct, frozen=True, eq=False, kw_only=True):
     loaders: tuple[str, ...] = ()
     batch: int | None = None
     noise: tuple[NoiseMode, ...] = ("keep", "zero")
+    beside: Callable[[bytes], Mapping[str, bytes]] | None = None
 
     @property
     def own_names(self) -> frozenset[str]:
         """The formats whose files have this consumer's names in every bundle (``.nn`` of API version 2)."""
         return frozenset(key for key in self.formats if WRITTEN[key].consumer == self.name)
+
+    def complete(self, artifact: Artifact) -> Artifact:
+        """Return an artefact with what the consumer has beside its file."""
+        if self.beside is None:
+            return artifact
+        made = self.beside(artifact.files[artifact.main].to_bytes())
+        return replace(artifact, files={**artifact.files, **{name: Pieces(data) for name, data in made.items()}})
 
     def write_options(self, contract: str) -> WriteOptions:
         """Return how a writer makes the files of this consumer."""

@@ -8,9 +8,17 @@ from functools import partial
 from export_model.converters.consumers.mlagents import version2, version3
 from export_model.converters.consumers.mlagents.tensorflowsharp import Generation, dress
 from export_model.converters.consumers.profile import Profile
-from export_model.converters.consumers.robots.naming import GODOT_RL, ISAAC_LAB, name_for_godot_rl, name_for_isaac_lab
+from export_model.converters.consumers.robots.byte_array import sources
+from export_model.converters.consumers.robots.naming import (
+    GODOT_RL,
+    ISAAC_LAB,
+    PX4,
+    name_for_godot_rl,
+    name_for_isaac_lab,
+    name_for_px4,
+)
 from export_model.converters.consumers.unity.consumers import editor_hint, purpose_text, releases_for
-from export_model.converters.formats.registry import BARRACUDA, FROZEN_GRAPH, ONNX
+from export_model.converters.formats.registry import BARRACUDA, FROZEN_GRAPH, LITERT, ONNX
 from export_model.signatures.errors import UsageError, suggestion
 
 #: What CoreBrainInternal.cs gave as pictures until 0.4.0b.
@@ -123,6 +131,17 @@ PROFILES: tuple[Profile, ...] = (
         code="godot",
         loaders=("Godot RL Agents",),
         noise=("zero",),
+    ),
+    Profile(
+        name=PX4,
+        purpose="PX4's neural control (mc_nn_control): 15 numbers to 4 motors, .tflite and the C array of it",
+        formats=(LITERT.key,),
+        dress=name_for_px4,
+        code="px4",
+        loaders=("PX4",),
+        batch=1,
+        noise=("zero",),
+        beside=sources,
     ),
 )
 

@@ -319,7 +319,7 @@ def _next_for(results: Sequence[ExportResult], profile: str, sources: Sequence[P
 
 
 def _files(result: ExportResult) -> str:
-    return ", ".join(sorted(p.name for p in result.folder.iterdir() if p.suffix in (".onnx", ".nn", ".bytes")))
+    return ", ".join(sorted(p.name for p in result.folder.iterdir() if p.is_file() and p.suffix != ".json"))
 
 
 def _next(results: Sequence[ExportResult], sources: Sequence[Path]) -> list[str]:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     core=("robot", "check", "write", "step", "as_json"),
 )
 @click.argument("source", type=PATH, metavar="POLICY")
-@click.option("--robot", metavar="NAME", help="A known robot (g1, go2 …), a URDF or MJCF, or a YAML of yours.")
+@click.option("--robot", metavar="NAME", help="A known robot (g1, go2 …), a URDF, MJCF or YAML of yours.")
 @click.option("--check", type=FILE, metavar="FILE", help="Hold what this file states against the weights.")
 @click.option("--write", type=FILE, metavar="FILE", help="Write what is decided, for --interface.")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")

@@ -95,11 +95,12 @@ def artefacts_of(
                     notes.append(f"{form.key} was left out: {error.what}: {error.why}")
             return contract, artifacts, tuple(notes)
         how = job.profile.write_options(contract.compact())
-        artifacts = [_artifact(f, job.policy, how) for f in formats]
+        artifacts = [job.profile.complete(_artifact(f, job.policy, how)) for f in formats]
         for artifact in artifacts if job.profile.loaders else ():
             from export_model.converters.consumers.robots.loaders import loadable
 
-            loadable(job.profile.name, job.profile.loaders, artifact.files[artifact.main].to_bytes(), job.policy.name)
+            files = {name: data.to_bytes() for name, data in artifact.files.items()}
+            loadable(job.profile.name, job.profile.loaders, files, artifact.main, job.policy.name)
         if job.profile.importers:
             from export_model.converters.consumers.importable import importable
             from export_model.converters.consumers.playable import playable

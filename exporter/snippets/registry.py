@@ -10,8 +10,17 @@ from typing import Any
 from msgspec import Struct
 
 from export_model.converters.formats.format import Code, Format
-from export_model.converters.formats.registry import BARRACUDA, CSHARP, FROZEN_GRAPH, ONNX, SAVED_MODEL, TFJS, WRITTEN
-from export_model.exporter.snippets import agent, csharp, godot, javascript, python, recorders, serving, unity
+from export_model.converters.formats.registry import (
+    BARRACUDA,
+    CSHARP,
+    FROZEN_GRAPH,
+    LITERT,
+    ONNX,
+    SAVED_MODEL,
+    TFJS,
+    WRITTEN,
+)
+from export_model.exporter.snippets import agent, csharp, godot, javascript, px4, python, recorders, serving, unity
 from export_model.exporter.snippets.contract import SnippetBundle, string_literal
 from export_model.signatures.errors import BundleError, UsageError
 
@@ -84,6 +93,7 @@ TARGETS: tuple[Caller, ...] = (
     ),
     Caller("inference-engine", "Unity Inference Engine (Sentis), C#", "csharp", (ONNX,), csharp.inference_engine),
     Caller("godot", "Godot RL Agents, an AIController, GDScript", "gdscript", (ONNX,), godot.godot),
+    Caller("px4", "PX4's neural control, a shell", "sh", (LITERT,), px4.px4),
     Caller("agent", "Unity, an ML-Agents Agent, C#", "csharp", (ONNX, BARRACUDA), agent.agent),
     Caller("source-agent", "Unity without a runtime, an Agent's Heuristic", "csharp", (CSHARP,), csharp.source_agent),
 )

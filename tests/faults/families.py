@@ -20,6 +20,7 @@ from fixtures.trained import run_folder
 from tests.fuzz.seeds import READERS
 from tests.interfaces.made import mjlab
 from tests.known import SHARED, sources
+from tests.robots.quadrotors import quadrotor
 from tests.stable_baselines3.saved_models import saved as saved_zip
 from tests.torch_checkpoint.robots import checkpoint
 from tests.torch_checkpoint.test_robots import SENSORS
@@ -147,6 +148,7 @@ def _written() -> Iterator[Member]:
         for profile in ("unity6", "barracuda-3"):
             yield Member("profiles", name, _onnx(f"torch_checkpoint/{name}"), more={"profile": profile})
     yield Member("profiles", "continuous", _is(frozen("continuous")), more={"compile": CompileOptions(noise="keep")})
+    yield Member("profiles", "quadrotor, px4", quadrotor, more={"profile": "px4"})
     isaac = {"read": how_read("rsl_5_5"), "more": {"profile": "isaac-lab"}}
     yield Member("profiles", "rsl_5_5", lambda folder: saved_state(folder, "rsl_5_5"), **isaac)  # type: ignore[arg-type]
     yield Member("interfaces", "mjlab", lambda folder: mjlab(folder, next(iter(_tasks()))))

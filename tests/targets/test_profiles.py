@@ -364,10 +364,10 @@ def test_what_does_not_go_together_is_refused(how: dict[str, str], said: str, tm
     assert not list(tmp_path.iterdir())
 
 
-#: A mean and a draw beside it, made inside the graph.
+#: A mean and a draw beside it, made inside the graph, of the sizes that PX4 takes.
 DRAWN = [
-    placeholder("vector_observation"),
-    *dense("mu", "vector_observation", 3, 2),
+    placeholder("vector_observation", (None, 15)),
+    *dense("mu", "vector_observation", 15, 4),
     node("rows", "Shape", "mu", out_type=np.int32),
     node("draw", "RandomStandardNormal", "rows", dtype=np.float32),
     node("action", "Add", "mu", "draw"),

@@ -1,4 +1,4 @@
-"""The rules of loaders: what a program outside Unity asks of an ONNX file, each with the line that shows it.
+"""The rules of loaders: what a program outside Unity asks of a file, each with the line that shows it.
 
 Evidence is a file of the project's public repository at a commit. The files were read, not run here; what they do with
 a session is done with onnxruntime in tests/robots.
@@ -10,7 +10,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from msgspec import Struct
 
-from export_model.converters.consumers.robots.interface import FileInterface
+from export_model.converters.consumers.robots.byte_array import SOURCE
+from export_model.converters.consumers.robots.interface import FileInterface, interface_of, interface_of_litert
+from export_model.converters.formats.registry import LITERT, ONNX
 from export_model.signatures.errors import ProfileError
 
 _RNN = "leggedrobotics/rsl_rl@14d428d7 rsl_rl/models/rnn_model.py"
@@ -20,7 +22,14 @@ _INFERENCE = "edbeeching/godot_rl_agents_plugin@1041a3ab addons/godot_rl_agents/
 _INITIALIZE = "edbeeching/godot_rl_agents_plugin, ONNXInference.cs of plugin 0.7 and later"
 _PROJECT = "edbeeching/godot_rl_agents_plugin@5b09dc90 Godot RL Agents.csproj (onnxruntime 1.15.1)"
 
+_PX4 = "PX4/PX4-Autopilot@01486656 src/modules/mc_nn_control/mc_nn_control.cpp"
+_PX4_CHECKS = "PX4/PX4-Autopilot@18eccd7a src/modules/mc_nn_control/nn_control_checks.hpp"
+
 OBS, ACTIONS = "obs", "actions"
+#: How many numbers PX4 feeds and takes, and what it registers of LiteRT's operators.
+PX4_OBSERVED, PX4_MOTORS = 15, 4
+PX4_OPERATORS = frozenset(("FULLY_CONNECTED", "RELU", "ADD"))
+_SCHEMA = 3
 HIDDEN, CELL = ("h_in", "h_out"), ("c_in", "c_out")
 STATE, OUTPUT = ("state_ins", "state_outs"), "output"
 #: How many inputs and outputs of Isaac Lab's files have which names.
@@ -37,10 +46,12 @@ class LoaderRule(Struct, frozen=True):
 
 
 class Loader(Struct, frozen=True):
-    """A program that loads a policy as ONNX."""
+    """A program that loads a policy, as a file of ``format``."""
 
     name: str
     rules: tuple[LoaderRule, ...]
+    format: str = ONNX.key
+    fix: str = "export without --for, and name the tensors in your own loader"
 
     def faults(self, file: FileInterface) -> Iterator[LoaderRule]:
         """The rules that a file does not meet."""
@@ -130,21 +141,63 @@ LOADERS: Mapping[str, Loader] = {
                 ),
             ),
         ),
+        Loader(
+            "PX4",
+            (
+                LoaderRule(
+                    f"there is one input of {PX4_OBSERVED} numbers, for one vehicle, and one output of {PX4_MOTORS}",
+                    f"{_PX4_CHECKS} model_layout_problem",
+                    lambda f: (
+                        [t.dims for t in (*f.inputs, *f.outputs)] == [(1, PX4_OBSERVED), (1, PX4_MOTORS)]
+                        and len(f.inputs) == 1
+                    ),
+                ),
+                LoaderRule("all are float32", f"{_PX4_CHECKS} model_layout_problem", _all_float),
+                LoaderRule(
+                    f"the operators are {', '.join(sorted(PX4_OPERATORS))}: others are not registered",
+                    f"{_PX4} RegisterOps",
+                    lambda f: f.operators <= PX4_OPERATORS,
+                ),
+                LoaderRule(
+                    f"the version of LiteRT's schema is {_SCHEMA}",
+                    f"{_PX4_CHECKS} model_layout_problem",
+                    lambda f: f.ir == _SCHEMA,
+                ),
+                LoaderRule(
+                    f"{SOURCE} has the bytes of the file: they are what is built",
+                    f"{_PX4} InitializeNetwork",
+                    lambda f: f.array,
+                ),
+            ),
+            LITERT.key,
+            "register what it lacks in RegisterOps, or change the sizes there, and take --to litert --batch 1",
+        ),
     )
 }
 
 
-def loadable(profile: str, names: Sequence[str], model: bytes, policy: str) -> None:
-    """Raise ProfileError where one of the loaders ``names`` would not load a ``model`` made for ``profile``."""
-    from export_model.converters.consumers.robots.interface import interface_of
+def file_interface(loader: Loader, files: Mapping[str, bytes], main: str) -> FileInterface:
+    """Return what a loader sees of an artefact; ``files`` by name, ``main`` the one that it loads.
+
+    Raises DamagedFileError.
+    """
+    if loader.format == LITERT.key:
+        return interface_of_litert(files[main], files.get(SOURCE, b"").decode("utf-8", "replace"))
     from export_model.converters.formats.onnx.proto import decode_model
 
-    file = interface_of(decode_model(model))
+    return interface_of(decode_model(files[main]))
+
+
+def loadable(profile: str, names: Sequence[str], files: Mapping[str, bytes], main: str, policy: str) -> None:
+    """Raise ProfileError where one of the loaders ``names`` would not load the files made for ``profile``."""
     for loader in (LOADERS[name] for name in names):
+        file = file_interface(loader, files, main)
         for rule in loader.faults(file):
             raise ProfileError(
                 f"{policy!r} cannot be made for {profile}: {loader.name} asks that {rule.says}",
                 why=f"the file has {', '.join(t.text for t in file.inputs)} → "
-                f"{', '.join(t.text for t in file.outputs)} ({rule.evidence})",
-                fix="export without --for, and name the tensors in your own loader",
+                f"{', '.join(t.text for t in file.outputs)}"
+                + (f", with {', '.join(sorted(file.operators))}" if file.operators else "")
+                + f" ({rule.evidence})",
+                fix=loader.fix,
             )

@@ -1,4 +1,4 @@
-"""Policies in the names of Isaac Lab (rsl_rl) and Godot RL Agents: one row of observations in, one of actions out.
+"""Policies in the names of Isaac Lab (rsl_rl), Godot RL Agents and PX4: one row of observations in, one of actions out.
 
 Both are deployed without chance: the mean of continuous actions, the scores of discrete ones.
 """
@@ -19,12 +19,13 @@ from export_model.converters.consumers.mlagents.output_mapping import (
     log_probabilities,
 )
 from export_model.converters.consumers.robots.loaders import ACTIONS, CELL, HIDDEN, OBS, OUTPUT, STATE
+from export_model.converters.formats.registry import LITERT, ONNX
 from export_model.converters.graph.types import BATCH
 from export_model.converters.policy.policy import Policy
 from export_model.signatures.roles import Role
 from export_model.signatures.spec import Memory, TensorSpec
 
-ISAAC_LAB, GODOT_RL = "isaac-lab", "godot-rl"
+ISAAC_LAB, GODOT_RL, PX4 = "isaac-lab", "godot-rl", "px4"
 _PARTS = {"h": HIDDEN, "c": CELL}
 
 
@@ -39,17 +40,44 @@ def name_for_isaac_lab(policy: Policy) -> Policy:
     memory = policy.signature.memory
     if memory is not None:
         _take_states(dressing, memory)
+    _give_mean(dressing, "rsl_rl's policies give the mean of a Gaussian, a number for each joint or motor", ONNX.key)
+    return dressing.finish(None if memory is None else _give_states(dressing, memory))
+
+
+def name_for_px4(policy: Policy) -> Policy:
+    """The policy as PX4's mc_nn_control has it: ``obs`` [1, 15] to ``actions`` [1, 4], the mean.
+
+    It feeds, in this order (``PopulateInputTensor``): the position's error (3) east, north, up; the first two rows (6)
+    of the rotation from the body (front, left, up) to that; the linear velocity (3) as the error; the angular velocity
+    (3) of the body. It clamps what it gets to -1 … 1 (``RescaleActions``).
+    Raises ProfileError for policies with memory and for actions that are not continuous.
+    """
+    dressing = Dressing(policy, PX4)
+    if policy.signature.memory is not None:
+        dressing.refuse(
+            "it has a memory",
+            why="mc_nn_control feeds one row of numbers, and keeps none",
+            fix="train without memory, or take --to litert or --to c into a module of your own",
+        )
+    _take_row(dressing)
+    _give_mean(dressing, "mc_nn_control takes a number for each of four motors", LITERT.key)
+    dressing.notes.append(
+        "mc_nn_control feeds the position error (3, east-north-up), rows 1 and 2 of the body's rotation (6), the "
+        "linear velocity (3, east-north-up) and the angular velocity (3, front-left-up); it clamps actions to -1 … 1"
+    )
+    return dressing.finish(None)
+
+
+def _give_mean(dressing: Dressing, why: str, target: str) -> None:
+    """Give ``actions``, the mean of continuous actions; refuse others."""
     dressing.take_over(None)
     found = heads(dressing)
     if found.continuous is None or found.discrete is not None:
         dressing.refuse(
-            "its actions are not continuous alone",
-            why="rsl_rl's policies give the mean of a Gaussian, a number for each joint or motor",
-            fix="write the policy for your own runner: --to onnx",
+            "its actions are not continuous alone", why=why, fix=f"write the policy for your own runner: --to {target}"
         )
     _, mean, _ = continuous_rows(dressing, found.continuous)
     dressing.give(ACTIONS, mean, Role.DETERMINISTIC, found.continuous.source)
-    return dressing.finish(None if memory is None else _give_states(dressing, memory))
 
 
 def name_for_godot_rl(policy: Policy) -> Policy:

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from export_model.converters.files.fetch import read_bytes
 from export_model.exporter.verify.findings import Accepted, Finding, Played
 from export_model.exporter.verify.tolerances import Tolerance
 
@@ -29,17 +30,17 @@ def consumers(name: str | None, files: Mapping[str, Path], *, memory: bool = Fal
     from export_model.converters.consumers.profiles import profile
     from export_model.converters.consumers.unity.checker import check_file
     from export_model.converters.consumers.unity.consumers import consumer
-    from export_model.converters.formats.registry import ONNX
 
     wanted = profile(name)
     for loader in wanted.loaders:
-        from export_model.converters.consumers.robots.interface import interface_of
-        from export_model.converters.consumers.robots.loaders import LOADERS
-        from export_model.converters.consumers.unity.onnx_file import read_onnx_file
+        from export_model.converters.consumers.robots.byte_array import SOURCE
+        from export_model.converters.consumers.robots.loaders import LOADERS, file_interface
 
-        file = interface_of(read_onnx_file(files[ONNX.key]).model)
-        faults = [f"{rule.says} ({rule.evidence})" for rule in LOADERS[loader].faults(file)]
-        yield _finding(Accepted, ONNX.key, loader, faults)
+        program = LOADERS[loader]
+        main = files[program.format]
+        near = {f.name: read_bytes(f) for f in (main, main.with_name(SOURCE)) if f.is_file()}
+        faults = [f"{rule.says} ({rule.evidence})" for rule in program.faults(file_interface(program, near, main.name))]
+        yield _finding(Accepted, program.format, loader, faults)
     for release in dict.fromkeys((*wanted.checkers, *wanted.players)):
         asked = consumer(release)
         for key in (k for k in asked.formats if k in files):
