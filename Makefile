@@ -29,7 +29,8 @@ install: $(STAMP)
 
 $(STAMP): pyproject.toml constraints.txt $(JS)/package-lock.json $(TESTS_JS)/package-lock.json
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt --editable '.[all,openvino,dev,docs]'
+	$(BIN)/python -c "import tomllib; groups = tomllib.load(open('pyproject.toml', 'rb'))['dependency-groups']; print(*sum(groups.values(), []), sep='\n')" > $(VENV)/groups.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt --requirement $(VENV)/groups.txt --editable '.[all,openvino]'
 	$(BIN)/python -m compileall -q -q -j 0 $(VENV)/lib || true # as pip does, on all processors; a template is no program
 	cd $(JS) && npm ci --ignore-scripts --no-audit --no-fund --loglevel=error
 	cd $(TESTS_JS) && npm ci --ignore-scripts --no-audit --no-fund --loglevel=error

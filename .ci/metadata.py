@@ -30,6 +30,7 @@ class CustomMetadataHook(MetadataHookInterface):
         text = (Path(self.root) / "README.md").read_text(encoding="utf-8")
         metadata["readme"] = {"content-type": "text/markdown", "text": absolute(text, repository)}
         metadata["urls"] = {
+            "Homepage": repository,
             "Repository": repository,
             "Documentation": f"{repository}/blob/HEAD/docs/index.md",
             "Changelog": f"{repository}/blob/HEAD/CHANGELOG.md",
