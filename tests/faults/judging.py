@@ -120,7 +120,7 @@ class Subject:
         if report.passed is False:
             outcome.located = fault is not None and self._is_located(report, fault)
             outcome.says = "; ".join(dict.fromkeys(f"{f.kind} {f.output}" for f in report.failures))
-        elif fault is not None and fault.policy is not None and (none := self._unseen(fault.policy)):
+        elif fault is not None and (none := self._unseen(fault)):
             outcome.verdict = none
         else:
             outcome.verdict, outcome.says = "passed" if fault is None else "missed", report.verdict
@@ -165,13 +165,15 @@ class Subject:
             for f in report.failures
         )
 
-    def _unseen(self, other: Policy) -> str:
+    def _unseen(self, fault: Fault) -> str:
         """Why a fault need not be seen; empty where it must be.
 
         No number beyond the tolerance and no decision is another on inputs of the policy's own; or, in a file that is
         not cut, only draws of classes are, by less than docs/agreement.md says is seen.
         """
-        policy, signature = self.job.policy, self.job.policy.signature
+        policy, other, signature = self.job.policy, fault.policy, self.job.policy.signature
+        if other is None:  # among one class there is no choice
+            return "no effect" if fault.kind.startswith("choose") and max(signature.branches) == 1 else ""
         draws = [n.name for n in policy.graph.nodes if n.op == "Multinomial"]
         fetches = [*policy.fetches.values(), *draws]
         drawn = policy.graph.descendants([n.name for n in policy.graph.nodes if n.op in SAMPLERS])
