@@ -163,6 +163,22 @@ def spread_fit(shares: np.ndarray) -> float:
     return min(1.0, 2 * math.exp(-(off**2) / (2 * (0.8 * shares.size + 2 * off / 3))))
 
 
+def same_spread(reference: np.ndarray, draws: np.ndarray, near: float) -> float:
+    """The p-value of two samples of one size, float [n] each, being as spread, by their ranks among all of both.
+
+    Were they alike, either of a pair could be the other's: Hoeffding's inequality for sums of such signs. A draw that
+    is ``near`` one of the reference counts as that: where an action saturates, runtimes round it differently.
+    """
+    known = np.sort(reference)
+    above = np.searchsorted(known, draws).clip(1, known.size - 1)
+    nearest = np.where(draws - known[above - 1] < known[above] - draws, known[above - 1], known[above])
+    draws = np.where(np.abs(nearest - draws) <= near, nearest, draws)
+    (shares,) = ranks(np.concatenate([reference, draws])[:, None]).T
+    one, other = np.split(np.square(shares), 2)
+    size = float(np.square(other - one).sum())
+    return min(1.0, 2 * math.exp(-(float((other - one).sum()) ** 2) / (2 * size))) if size else 1.0
+
+
 def _ahead(a: np.ndarray, b: np.ndarray, atol: float, rtol: float) -> int:
     """How many more of sorted ``a`` than of sorted ``b`` are at most x, at worst, b's being given the tolerance."""
     below = np.searchsorted(b, a + atol + rtol * np.abs(a), side="right")

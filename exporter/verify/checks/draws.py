@@ -48,7 +48,9 @@ CALLED_ALIKE = "its draws are the same in every call: the sampler begins anew ea
 STILL_DRAWN = "it draws where the policy does not: its answers differ where all that the policy draws is the same"
 #: What tests of a distribution see, with the numbers of draws that they have (docs/agreement.md).
 CLASSES_SEEN = "a share of one half that is off by 0.04 is seen, and one of a fiftieth by 0.012"
-NUMBERS_SEEN = "a shift of half their spread is seen at one input, of a seventh at all"
+NUMBERS_SEEN = (
+    "a shift of half their spread is seen at one input, of a seventh at all, a spread a seventh too wide at all"
+)
 MISFED = "it draws from other odds than the policy, though every tensor of the policy agrees"
 ODDS = "the log-probabilities that its classes are drawn from differ by {:.3g}"
 #: Where all sessions of a process begin alike whatever the model, two processes are what tells.
