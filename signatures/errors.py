@@ -2,10 +2,10 @@
 
 ::
 
-    ExportModelError            what happened, where, why, what to do; ``exit_status`` of the command line
+    ExportModelError            what happened, where, why, what to do; its ``exit_status`` follows
     ├── UsageError              2  the command line or the call is wrong
     ├── SourceError             2  the source cannot be read
-    │   ├── NotAPolicyError     2  it is readable, but it is not a policy (or not what the reader was asked for)
+    │   ├── NotAPolicyError     2  readable, but not a policy (or not what the reader was asked for)
     │   └── DamagedFileError    2  it is cut off, empty, or breaks its own format
     ├── RefusedError            2  of several sources, some could not be exported
     ├── GraphError              2  a node of the graph is wrong or cannot be converted
