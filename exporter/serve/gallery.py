@@ -32,7 +32,7 @@ body {
   margin: 0 auto; max-width: 1200px; padding: 32px 20px 56px; background: var(--paper); color: var(--ink);
   font: 15px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, sans-serif; overflow-wrap: anywhere;
 }
-h1 { font-size: 26px; margin: 0; } h2 { font-size: 18px; margin: 10px 0 0; }
+h1 { font-size: 26px; margin: 0; } h2 { font-size: 18px; margin: 10px 0 0; align-self: end; }
 p { margin: 2px 0; color: var(--soft); }
 ul { list-style: none; margin: 24px 0 0; padding: 0; display: grid; gap: 20px; }
 ul { grid-template-columns: repeat(auto-fill, minmax(min(320px, 100%), 1fr)); }

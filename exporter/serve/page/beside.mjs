@@ -46,10 +46,10 @@ export function fitting(own, other) {
 
 /** What may be dropped on this page, said before somebody tries. `engines`: the names of its engines. */
 export function droppable(engines) {
-  if (isOneFile) return "Drop the folder of a bundle here to compare it. It takes one exported with js among --to: this page runs nothing but modules.";
+  if (isOneFile) return "Drop the folder of a bundle here to compare it, exported with --to js: this page runs modules only.";
   if (engines.has("onnxruntime-web")) return "Drop the folder of a bundle here to compare it, or an .onnx that export-model wrote.";
-  if (engines.has("cpu")) return "Drop the folder of a bundle here to compare it. This page runs no .onnx: that takes onnxruntime-web.";
-  return "Nothing can be dropped here: that takes TensorFlow.js, or a page of one file.";
+  if (engines.has("cpu")) return "Drop the folder of a bundle here to compare it. An .onnx needs onnxruntime-web, which is not in this page.";
+  return "Nothing can be dropped here: it needs TensorFlow.js, or a page of one file.";
 }
 
 /**
