@@ -62,7 +62,7 @@ def out(tmp_path: Path) -> Iterator[Path]:
         (["--opset", "22"], ["opset 22"]),
         (["--opset", "-1"], ["opset -1"]),
         (["--verify", "tensorflo"], ["unknown runtime 'tensorflo'", "numpy, tensorflow"]),
-        (["--verify", "onnxruntime,torch"], ["unknown runtime 'torch'"]),
+        (["--verify", "onnxruntime,mxnet"], ["unknown runtime 'mxnet'"]),
         (["--seed", "-1"], ["seed -1: must be a whole number"]),
         (["--atol", "nan"], ["--atol nan"]),
         (["--golden", "nowhere.npz"], ["--golden needs a verification", "--verify none"]),
