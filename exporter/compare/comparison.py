@@ -235,12 +235,13 @@ def _check_options(
 def _reference(
     path: Path, understanding: CompileOptions | None, read: ReadOptions | None
 ) -> tuple[SourceModel, Policy]:
-    found = list(read_source(path, read).compile_models(understanding))
+    source = read_source(path, read)
+    found = list(source.compile_models(understanding))
     if len(found) > 1:
         raise UsageError(
             f"the reference holds {len(found)} policies",
             where=str(path),
-            why=", ".join(p.name for _, p in found),
+            why=", ".join(p.name.removeprefix(f"{source.stem(m)}-") for m, p in found),
             fix="choose one with --brain, or give one model of it",
         )
     return found[0]

@@ -187,7 +187,7 @@ def read_candidate(
             raise SourceError(
                 f"the candidate holds {len(found)} policies",
                 where=str(path),
-                why=", ".join(p.name for _, p in found),
+                why=", ".join(p.name.removeprefix(f"{source.stem(m)}-") for m, p in found),
                 fix="choose one with --brain, or give one model of it",
             )
     model, policy = found[0]

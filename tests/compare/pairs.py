@@ -146,7 +146,7 @@ def _option(error: ExportModelError, pair: Pair) -> tuple[str, dict[str, Any]] |
     if asked is None:
         return None
     if asked[2] == "brain":
-        brain = CompileOptions(brain=(error.why or "").split(", ")[0].partition("-")[2])
+        brain = CompileOptions(brain=(error.why or "").split(", ")[0])
         return f"--brain {brain.brain}", {"understanding": brain, "candidate_understanding": brain}
     (policy,) = read_source(pair.reference if asked[1] else pair.candidate).policies()  # which says what it observes
     roles = (Role.VECTOR, Role.VISUAL, Role.ENTITIES)

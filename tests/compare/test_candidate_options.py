@@ -37,6 +37,17 @@ def files(folder: Path) -> dict[str, tuple[Path, tuple[str, ...]]]:
     }
 
 
+def test_several_policies_are_called_as_brain_takes_them() -> None:
+    ran = export_model("compare", path("twobrains"), path("twobrains"), "--verify", "none")
+    named = ran.err.partition("why: ")[2].partition("\n")[0].split(", ")
+    assert len(named) == 2
+    for brain in named:
+        flags = ("--brain", brain, "--candidate-brain", brain)
+        assert (
+            export_model("compare", path("twobrains"), path("twobrains"), "--verify", "tensorflow", *flags).status == 0
+        )
+
+
 CASES = [(name, side) for name in files(Path()) for side in ("reference", "candidate")]
 CASES.remove(("brain", "candidate"))  # a graph of several is fed by its own names
 
