@@ -35,7 +35,11 @@ def split_memory(parts: Sequence[SourcePart], memory: np.ndarray) -> dict[str, n
     """What the source is fed for a memory [B, n]: each part's columns in its shape."""
     ends = np.cumsum([part.size for part in parts])
     fed = {}
-    for part, columns in zip(parts, np.split(memory, ends[:-1], axis=1), strict=True):
+    for part, end in zip(parts, ends.tolist(), strict=True):
+        columns = memory[:, end - part.size : end]
+        if len(columns) == 1:  # no axis has to move: a source of one row is asked so a million times
+            fed[part.tensor] = columns.reshape([1 if d is None else d for d in part.shape])
+            continue
         rest = [d for d in part.shape if d is not None]
         rows = columns.reshape(columns.shape[0], *rest)
         fed[part.tensor] = np.ascontiguousarray(np.moveaxis(rows, 0, part.axis))
@@ -44,7 +48,10 @@ def split_memory(parts: Sequence[SourcePart], memory: np.ndarray) -> dict[str, n
 
 def join_memory(parts: Sequence[SourcePart], values: Mapping[str, np.ndarray]) -> np.ndarray:
     """The memory [B, n] that the source gave in ``parts``; the inverse of ``split_memory``."""
-    rows = [np.moveaxis(values[part.tensor], part.axis, 0) for part in parts]
+    found = [values[part.tensor] for part in parts]
+    if all(value.shape[part.axis] == 1 for part, value in zip(parts, found, strict=True)):
+        return np.concatenate([value.reshape(1, -1) for value in found], axis=1)
+    rows = [np.moveaxis(value, part.axis, 0) for part, value in zip(parts, found, strict=True)]
     return np.concatenate([r.reshape(r.shape[0], -1) for r in rows], axis=1)
 
 

@@ -28,6 +28,9 @@ from export_model.signatures.spec import PolicySignature
 
 #: Products that a row may cost: thousands of causes are tried on dozens of rows.
 _MOST_PRODUCTS = 3_000_000
+#: Runs that a search may make, and rows of them all: it goes on from cause to cause where none is enough, and a policy
+#: with a memory is run step by step. Of what is found, one cause of a memory takes most, 3,073 runs and 310,000 rows.
+_MOST_RUNS, _MOST_ROWS = 4_000, 450_000
 #: Episodes side by side, and steps of each.
 _EPISODES, _STEPS = 16, 16
 
@@ -65,6 +68,10 @@ _WORDS = (
 )
 
 
+class _WorkDoneError(Exception):
+    """A search has cost what it may."""
+
+
 class Explaining:
     """Other checks, and where one of them fails, one cause that explains the difference: a sentence in ``notes``."""
 
@@ -80,6 +87,10 @@ class Explaining:
         heads = _shared_actions(trial, participant)
         if heads and not all(f.passed for f in findings) and products(trial.tested.graph) <= _MOST_PRODUCTS:
             for side, other, explanation in _explanations(trial, participant, heads):
+                if explanation is None:
+                    cut = f"whether the {side} is the {other} with one change was not searched to the end"
+                    self.notes.append(f"{participant.name}: {cut}")
+                    continue
                 phrases = ", ".join(_phrases(explanation, side, other))
                 self.notes.append(f"{participant.name}: the {side} is the {other} with {phrases}")
                 self.causes += [
@@ -101,8 +112,11 @@ def _shared_actions(trial: Trial, participant: Participant) -> dict[str, str]:
 
 def _explanations(
     trial: Trial, participant: Participant, heads: Mapping[str, str]
-) -> Iterator[tuple[str, str, Explanation]]:
-    """Yield (the side that is the other with something, the other, with what), once at most."""
+) -> Iterator[tuple[str, str, Explanation | None]]:
+    """Yield (the side that is the other with something, the other, with what), once at most.
+
+    None stands for a search that was not ended.
+    """
     signature = trial.signature
     pair = signature.recurrence
     if pair is not None and pair[1] not in participant.outputs:
@@ -120,10 +134,29 @@ def _explanations(
         return  # other actions: no cause makes them these
     for side, other in (("candidate", "reference"), ("reference", "candidate")):
         answered = [s.name for s in signature.outputs] if other == "reference" else participant.outputs
-        found = _explain(signature, runs[other], answered, logs[side], heads)
+        try:
+            found = _explain(signature, _bounded(runs[other]), answered, logs[side], heads)
+        except _WorkDoneError:
+            yield side, other, None
+            continue
         if found is not None and found.whole:
             yield side, other, found
             return
+
+
+def _bounded(run: Run) -> Run:
+    """A run that raises _WorkDoneError after ``_MOST_RUNS`` or ``_MOST_ROWS``."""
+    runs, rows = 0, 0
+
+    def run_counted(inputs: Sequence[Feeds], fetch: Sequence[str]) -> list[dict[str, np.ndarray]]:
+        nonlocal runs, rows
+        runs += 1
+        rows += sum(max((len(array) for array in feeds.values() if array.ndim), default=1) for feeds in inputs)
+        if runs > _MOST_RUNS or rows > _MOST_ROWS:
+            raise _WorkDoneError
+        return run(inputs, fetch)
+
+    return run_counted
 
 
 def _phrases(found: Explanation, side: str, other: str) -> Iterator[str]:

@@ -122,3 +122,13 @@ def test_a_memory_that_is_not_given_back_is_fed(wrong: bool, tmp_path: Path, poo
     assert [("state[1], state[3] exchanged" in sentence) for sentence in named] == [True] * wrong
     if not wrong:
         assert compare_artefacts(own, own, runtimes="onnxruntime", pool=pool).passed
+
+
+def test_a_search_ends(tmp_path: Path, pool: RuntimePool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where no cause was enough it went on for minutes, of a policy with a memory; that it was cut short is said."""
+    monkeypatch.setattr(explaining, "_MOST_RUNS", 40)
+    own = LSTM.path
+    other = planted(own, tmp_path / "other.onnx", before_input("Gather", np.array([0, 3, 2, 1, 4]), axis=1))
+    report = compare_artefacts(own, other, runtimes="onnxruntime", pool=pool)
+    assert report.passed is False
+    assert any("was not searched to the end" in note for note in report.notes)
