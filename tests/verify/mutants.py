@@ -183,6 +183,7 @@ def main() -> int:
     parser.add_argument("--only", default="", help="those of files whose path holds this")
     parser.add_argument("--numbers", default="", help="those of these numbers, joined by commas")
     parser.add_argument("--tests", nargs="+", default=[], help="those of these files alone: more survive")
+    parser.add_argument("--quick", action="store_true", help="the tests of seconds alone: more survive")
     options = parser.parse_args()
     every = mutants()
     numbers = {int(n) for n in options.numbers.split(",") if n} or set(range(len(every)))
@@ -192,10 +193,10 @@ def main() -> int:
     if not chosen:
         parser.error("there are no such mutants")
 
-    from tests.verify.mutation import TESTS, survivors
+    from tests.verify.mutation import QUICK, TESTS, survivors
 
     alive = Counter[str]()
-    for mutant, reason in survivors(chosen, options.tests or TESTS):
+    for mutant, reason in survivors(chosen, options.tests or (QUICK if options.quick else TESTS)):
         alive[mutant.file] += 1
         line = (ROOT / mutant.file).read_text().splitlines()[mutant.line - 1].strip()
         print(f"{mutant.number}: {mutant.file}:{mutant.line}: {mutant.what}: {line} ({reason})", flush=True)

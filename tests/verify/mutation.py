@@ -35,6 +35,11 @@ from tests.verify.mutants import ROOMS, ROOT, Mutant, broken, mutants
 
 #: Tests that may reach the judge, and start no runtime but those of the last.
 TESTS = ("tests/verify", "tests/exporter", "tests/reports", "tests/compare")
+#: Those that start nothing at all, and hardly any command: a mutant takes a second.
+QUICK = (
+    *("tests/verify", "tests/exporter/test_comparison.py", "tests/exporter/test_bisection.py"),
+    *("tests/compare/test_pairing.py", "tests/compare/test_handmade.py"),
+)
 #: Of a module, in the map: every test that runs a line of it.
 _ANY = "any"
 #: Where it is kept, by what it hangs on.
@@ -120,9 +125,7 @@ class Runner:
         shutil.rmtree(own, ignore_errors=True)
         if status == 0:
             self.alive.append((mutant, "all pass"))
-            print("s", end="", flush=True)
-        else:
-            print(".", end="", flush=True)
+        print(f" {mutant.number} survives " if status == 0 else ".", end="", flush=True)
 
     def _map(self, session: pytest.Session) -> tuple[Map, dict[str, float]]:
         """Which tests run which line, and how long each takes that passes."""
