@@ -17,6 +17,7 @@ from export_model.exporter.verify.checks.draws import draws
 from export_model.exporter.verify.checks.numbers import numbers
 from export_model.exporter.verify.checks.rollout import rollout
 from export_model.exporter.verify.options import VerifyOptions
+from export_model.exporter.verify.rounding import Hull
 from export_model.exporter.verify.tolerances import Tolerance
 from tests.handmade import constant, continuous_policy, dense, node, placeholder, sampled_policy
 from tests.verify.judged import Arrays, Feeds, compiled, judge, spoiling, wrong
@@ -25,13 +26,15 @@ Array = npt.NDArray[Any]
 F: dict[str, Any] = {"T": np.float32}
 
 
-def logarithms() -> Policy:
+def logarithms(steep: float = 1.0) -> Policy:
     """``action`` = a layer of log(sigmoid) of another, and ``value_estimate``, which rests on nothing that is open."""
     return compiled(
         [
             placeholder("vector_observation"),
             *dense("first", "vector_observation", 3, 4),
-            node("squashed", "Sigmoid", "first", **F),
+            constant("steep", steep),
+            node("wide", "Mul", "first", "steep", **F),
+            node("squashed", "Sigmoid", "wide", **F),
             node("logarithm", "Log", "squashed", **F),
             *dense("action", "logarithm", 4, 2),
             *dense("value_estimate", "vector_observation", 3, 1),
@@ -122,6 +125,22 @@ def test_typical_inputs_are_no_edges(lie: float, tmp_path: Path) -> None:
         logarithms(), tmp_path, spoiling("action", lambda f, a: np.where(_ordinary(f), lie, a).astype(a.dtype))
     )
     assert ("numbers", "action") in wrong(report)
+
+
+def test_typical_inputs_are_asked_about_as_ordinary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where their sigmoids are no float32 either: what is not told from zero is for far inputs alone."""
+    asked, forgive = list[bool](), Hull.forgive
+
+    def watch(self: Hull, answer: Array, reference: Array, *, ordinary: bool) -> Any:
+        asked.append(ordinary)
+        return forgive(self, answer, reference, ordinary=ordinary)
+
+    def moved(feeds: Feeds, action: Array) -> Array:
+        return action + np.float32(0.5)
+
+    monkeypatch.setattr(Hull, "forgive", watch)
+    assert wrong(judge(logarithms(steep=40.0), tmp_path, spoiling("action", moved), checks=(numbers,)))
+    assert True in asked and False in asked
 
 
 @pytest.mark.parametrize("row", [0, 1])
@@ -291,6 +310,22 @@ def test_each_column_of_drawn_numbers_is_compared(column: int, by: float, times:
 
     report = judge(policy, tmp_path, spoiling("action", one), checks=(numbers, draws))
     assert "action" in {f.output for f in report.failures}
+
+
+@pytest.mark.parametrize("column", [0, 1])
+def test_each_column_is_compared_at_each_input(column: int, tmp_path: Path) -> None:
+    """Moved at one input alone: all inputs together hardly show it."""
+    policy, moved = noisy(), list[Array]()
+
+    def one(feeds: Feeds, drawn: Array) -> Array:
+        if len(drawn) < 4096:
+            return drawn
+        moved[:] = moved or [feeds["state"][3]]
+        made = np.array(drawn)
+        made[(feeds["state"] == moved[0]).all(axis=1), column] += (0.5, 0.2)[column]
+        return made
+
+    assert wrong(judge(policy, tmp_path, spoiling("action", one), checks=(draws,))) == {("draws", "action")}
 
 
 def _means(policy: Policy, feeds: Feeds) -> Sequence[Array]:

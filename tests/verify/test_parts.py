@@ -176,6 +176,20 @@ def test_an_answer_lies_between_the_ends(zero: float, kept: float, whole: float,
     assert found.nan.tolist() == [bool(np.isnan(zero) != np.isnan(kept))]
 
 
+def test_each_element_lies_between_its_own_ends() -> None:
+    """One is open; rounding makes it wider, and opens no other."""
+    ends = [np.array([[1.0], [5.0]]), np.array([[2.0], [5.0]]), np.array([[1.5], [5.0]])]
+    for rounding, far in ((0.0, 3.0), (0.5, 3.5)):
+        found = hull(ends, np.array([[2.0], [5.0]]), rounding)
+        assert found.open.tolist() == [[True], [False]]
+        assert found.holds(np.array([[far], [5.0]])).tolist() == [[True], [False]]
+        assert found.holds(np.array([[far + 0.01], [5.0]])).tolist() == [[False], [False]]
+    (_, marked), *others = found.forgive(np.array([[1.5], [5.0]]), np.array([[2.0], [5.0]]), ordinary=True)
+    assert marked.tolist() == [[True], [False]] and not others, "at ordinary inputs what float64 says alone"
+    (_, marked), *_ = found.forgive(np.array([[1.6], [5.0]]), np.array([[2.0], [5.0]]), ordinary=True)
+    assert not marked.any()
+
+
 @pytest.mark.parametrize(("policy", "kind"), [(noisy, "normal"), (lambda: compiled(sampled_policy()), "categorical")])
 def test_a_policy_is_cut_at_its_samplers(policy: Any, kind: str, tmp_path: Path) -> None:
     tested = policy_under_test(policy(), {}, tmp_path, sizes={})

@@ -141,6 +141,15 @@ def test_the_worst_of_three_tests_says_whether_numbers_are_normal() -> None:
 
 
 @pytest.mark.parametrize("sign", [1, -1])
+def test_the_larger_of_two_gaps_counts(sign: int) -> None:
+    """Of two numbers, one of which is more often: mean 0, variance 1."""
+    low, high = -math.sqrt(2 / 3), math.sqrt(3 / 2)
+    apart = 0.6 - math.erfc(-low / math.sqrt(2)) / 2
+    drawn = sign * np.array([low] * 60 + [high] * 40)
+    assert normal_fit(drawn) == pytest.approx(3 * 2 * math.exp(-200 * apart**2), rel=1e-6)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
 def test_a_gap_on_either_side_is_as_far(sign: int) -> None:
     """All numbers of one half are brought to its edge: their mean and spread are then put right."""
     even = _quantiles(400)
