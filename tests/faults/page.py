@@ -20,20 +20,15 @@ def section(counted: Mapping[str, Any]) -> list[str]:
     return [
         "## Planted faults",
         "",
-        f"Planted on {counted['date']} by `{counted['command']}` into {counted['policies']} policies, judged by "
-        f"`export`, `verify --source` and `compare` in turn. {counted['without_effect']} more change nothing at 4,096 "
-        f"of the policy's own inputs, {len(counted['small'])} move odds in source code by less than agreement.md says "
-        "is seen. *Located*: the tensor or function is named.",
+        f"`{counted['command']}`, {counted['date']}, {counted['policies']} policies: caught, of these located, and "
+        f"missed, by `export`, `verify --source` and `compare` in turn; {counted['without_effect']} more change nothing"
+        f"{f', {small} odds too little to be seen' if (small := len(counted['small'])) else ''}.",
         "",
-        "| family | caught | located | missed |",
+        "|family|caught|located|missed|",
         "|---|---|---|---|",
-        *(
-            f"| {name} | {caught} | {located} | {planted - caught} |"
-            for name, (caught, located, planted) in rows.items()
-        ),
+        *(f"|{name}|{caught}|{located}|{every - caught}|" for name, (caught, located, every) in rows.items()),
         "",
-        f"Missed: {'; '.join(missed) or 'none'}.",
-        "",
+        *([f"Missed: {'; '.join(missed)}.", ""] if missed else []),
     ]
 
 
