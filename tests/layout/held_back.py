@@ -120,6 +120,7 @@ HELD_BACK = (
         Case(
             "ImChong/RL_Sim2Sim_Demo_Website",
             f"public/examples/checkpoints/g1/walk_run_getup_rtx4090_{n}/model_{n}.onnx",
+            *("g1", _AS, LAB, 4, "frame by frame"),
         )
         for n in ("50000", "59999")
     ),
