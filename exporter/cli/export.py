@@ -46,9 +46,7 @@ if TYPE_CHECKING:
 @click.argument("sources", nargs=-1, type=PATH, metavar="SOURCE...")
 @click.option("-o", "--out", type=PATH, default=Path("exported"), help="Folder for the bundles, or an address.")
 @click.option("--to", "targets", metavar="FORMATS", help="bytes,saved_model,tfjs,onnx; or nn,litert,c,csharp,js.")
-@click.option(
-    "--for", "profile", metavar="NAME", help="Make the files for a loader (unity6, …); 'help' lists all."
-)
+@click.option("--for", "profile", metavar="NAME", help="Make the files for a loader (unity6, …); 'help' lists all.")
 @click.option("--name", metavar="NAME", help="The policy's name (default: the file's).")
 @click.option(
     "--names",
