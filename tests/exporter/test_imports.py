@@ -48,10 +48,13 @@ def top_of(module: str) -> str:
     return module.removeprefix("export_model.").split(".")[0]
 
 
-def at_module_level(tree: ast.Module) -> Iterator[str]:
-    """The same, for imports that run when the module is imported."""
+def at_module_level(tree: ast.Module | ast.ClassDef) -> Iterator[str]:
+    """The same, for imports that run when the module is imported: not those of functions and methods."""
     for statement in tree.body:
         if isinstance(statement, ast.FunctionDef | ast.AsyncFunctionDef):
+            continue
+        if isinstance(statement, ast.ClassDef):
+            yield from at_module_level(statement)
             continue
         if isinstance(statement, ast.If) and ast.unparse(statement.test) == "TYPE_CHECKING":
             continue

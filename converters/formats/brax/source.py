@@ -17,7 +17,6 @@ from export_model.converters.files.fetch import Fetched
 from export_model.converters.files.orbax_arrays import is_orbax, read_arrays
 from export_model.converters.files.pickled_objects import Instance, Name, array_of, unpickle_objects
 from export_model.converters.formats.source import ReadOptions, SourceModel
-from export_model.converters.trainers.brax import CONFIGS
 from export_model.converters.trainers.pytorch.weights import ArraysByName
 from export_model.converters.trainers.registry import rebuild
 from export_model.converters.trainers.trainer import Saved
@@ -25,12 +24,14 @@ from export_model.signatures.errors import DamagedFileError
 
 #: Networks of brax nest two deep; what is deeper, or has more arrays, is none.
 _MAX_DEPTH, _MAX_ARRAYS = 8, 10_000
+#: What brax writes beside the arrays, of PPO and of SAC.
+_CONFIG = "*_network_config.json"
 _STATISTICS = ("mean", "std")
 
 
 def is_checkpoint(path: Path) -> bool:
     """Whether a folder is a step of orbax with brax's configuration beside the arrays."""
-    return is_orbax(path) and any((path / name).is_file() for name in CONFIGS)
+    return is_orbax(path) and any(path.glob(_CONFIG))
 
 
 def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:

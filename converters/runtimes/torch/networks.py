@@ -11,22 +11,22 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import torch
-from torch import nn
-from torch.nn import functional
+if TYPE_CHECKING:
+    import torch
+    from torch import nn
 
-State = dict[str, torch.Tensor]
+State = dict[str, Any]
 Network = Callable[[State], State]
 Told = Mapping[str, Any]
 
-#: What --activation calls them.
-ACTIVATIONS: Mapping[str, Callable[[], nn.Module]] = {
-    kind.__name__.lower(): kind
+#: What --activation calls them → their classes in torch.nn.
+ACTIVATIONS: Mapping[str, str] = {
+    kind.lower(): kind
     for kind in (
-        *(nn.ReLU, nn.Tanh, nn.Sigmoid, nn.Softplus, nn.Softsign, nn.ELU, nn.SELU, nn.CELU, nn.GELU, nn.SiLU, nn.Mish),
-        *(nn.LeakyReLU, nn.ReLU6, nn.Hardtanh, nn.Hardsigmoid, nn.Hardswish, nn.LogSigmoid, nn.Identity),
+        *("ReLU", "Tanh", "Sigmoid", "Softplus", "Softsign", "ELU", "SELU", "CELU", "GELU", "SiLU", "Mish"),
+        *("LeakyReLU", "ReLU6", "Hardtanh", "Hardsigmoid", "Hardswish", "LogSigmoid", "Identity"),
     )
 }
 #: How the name of what a normal draw is fed as ends.
@@ -42,33 +42,47 @@ def _loaded(layer: nn.Module, state: State, module: str) -> nn.Module:
     return layer.eval()
 
 
+def activation_layer(name: str) -> nn.Module:
+    """The layer that ``--activation`` names."""
+    from torch import nn
+
+    layer: nn.Module = getattr(nn, ACTIVATIONS[name])()
+    return layer
+
+
 def linear(state: State, module: str) -> nn.Module:
     """``nn.Linear``."""
+    from torch import nn
+
     out, width = state[f"{module}.weight"].shape
     return _loaded(nn.Linear(width, out, bias=f"{module}.bias" in state), state, module)
 
 
 def sequence(state: State, module: str, activation: str = "tanh", *, ends: bool = False) -> nn.Sequential:
     """``nn.Sequential`` by the trainer's own numbers: what has no weights there is the activation."""
+    from torch import nn
+
     places = {int(m[1]) for n in state if (m := re.match(rf"{re.escape(module)}\.(\d+)\.", n))}
     layers = nn.Sequential()
     for place in range(max(places, default=-1) + 1):
         name = f"{module}.{place}"
         if place not in places:
-            layers.append(ACTIVATIONS[activation]())
+            layers.append(activation_layer(activation))
         elif state[f"{name}.weight"].ndim == 1:
             layers.append(_loaded(nn.LayerNorm(len(state[f"{name}.weight"])), state, name))
         else:
             layers.append(linear(state, name))
     if places and not ends:
-        layers.append(ACTIVATIONS[activation]())
+        layers.append(activation_layer(activation))
     return layers
 
 
-class Memory:
+class RecurrentLayer:
     """``nn.LSTM`` or ``nn.GRU``; the memory is [B, …]: the layers' h, then (LSTM) their c."""
 
     def __init__(self, state: State, module: str) -> None:
+        from torch import nn
+
         self._rows, self._hidden = state[f"{module}.weight_hh_l0"].shape
         self._layers = sum(n.startswith("weight_hh_l") for n in _of(state, module))
         kind = nn.LSTM if self._rows == 4 * self._hidden else nn.GRU
@@ -77,6 +91,8 @@ class Memory:
 
     def __call__(self, x: torch.Tensor, memory: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the output of one step, and the memory after it."""
+        import torch
+
         before = memory.reshape(len(memory), -1, self._hidden).transpose(0, 1).contiguous()
         parts = before.split(self._layers)
         y, after = self._module(x[None], parts if len(parts) == 2 else parts[0])
@@ -85,6 +101,8 @@ class Memory:
 
 
 def _noise(feeds: State, mean: torch.Tensor) -> torch.Tensor:
+    import torch
+
     return next((t.reshape(mean.shape) for n, t in feeds.items() if n.endswith(_NOISE)), torch.zeros_like(mean))
 
 
@@ -99,7 +117,7 @@ def _rows_of(values: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:
 def rsl_rl(state: State, told: Told) -> Network:
     """``ActorCritic``, its recurrent kin, ``StudentTeacher`` of 2.3 and 3.1, ``MLPModel``, ``RNNModel`` of 5.5."""
     actor = sequence(state, told["actor"], told["activation"], ends=True)
-    memory = Memory(state, told["memory"]) if f"{told['memory']}.weight_ih_l0" in state else None
+    memory = RecurrentLayer(state, told["memory"]) if f"{told['memory']}.weight_ih_l0" in state else None
     normalisers = [_of(state, m) for m in told["normalisers"] if f"{m}._mean" in state]
 
     def act(feeds: State) -> State:
@@ -122,6 +140,8 @@ def rsl_rl(state: State, told: Told) -> Network:
 
 def scripts(state: State, told: Told) -> Network:
     """``Agent``, ``Actor`` and ``QNetwork`` of CleanRL's scripts without images, ``ActorCritic`` of PPO-PyTorch."""
+    import torch
+
     build, activation = told["build"], told["activation"]
     whole = partial(sequence, state, activation=activation, ends=True)
     if build in ("sac", "td3"):
@@ -130,7 +150,7 @@ def scripts(state: State, told: Told) -> Network:
         return partial(_values, whole("network"), state.get("atoms"))
     if build == "ppo_discrete":
         trunk = sequence(state, "network", activation)
-        memory = Memory(state, "lstm") if "lstm.weight_ih_l0" in state else None
+        memory = RecurrentLayer(state, "lstm") if "lstm.weight_ih_l0" in state else None
         actor = linear(state, "actor") if "actor.weight" in state else whole("actor")
         return partial(_choice, trunk, memory, actor)
     actor = whole("actor_mean" if build == "ppo_continuous" else "actor")
@@ -143,7 +163,7 @@ def scripts(state: State, told: Told) -> Network:
     return act
 
 
-def _choice(trunk: nn.Module, memory: Memory | None, actor: nn.Module, feeds: State) -> State:
+def _choice(trunk: nn.Module, memory: RecurrentLayer | None, actor: nn.Module, feeds: State) -> State:
     x, answers = trunk(feeds["obs"]), {}
     if memory is not None:
         x, answers["recurrent_out"] = memory(x, feeds["recurrent_in"])
@@ -151,6 +171,8 @@ def _choice(trunk: nn.Module, memory: Memory | None, actor: nn.Module, feeds: St
 
 
 def _values(network: nn.Module, atoms: torch.Tensor | None, feeds: State) -> State:
+    import torch
+
     values = network(feeds["obs"])
     if atoms is not None:  # C51
         values = (torch.softmax(values.reshape(len(values), -1, len(atoms)), 2) * atoms).sum(2)
@@ -158,8 +180,10 @@ def _values(network: nn.Module, atoms: torch.Tensor | None, feeds: State) -> Sta
 
 
 def _off_policy(state: State, activation: str) -> Network:
+    import torch
+
     hidden = [linear(state, f"fc{i}") for i in range(1, 1 + sum(bool(re.match(r"fc\d+\.weight", n)) for n in state))]
-    shape = ACTIVATIONS[activation]()
+    shape = activation_layer(activation)
     mean_layer = linear(state, "fc_mean" if "fc_mean.weight" in state else "fc_mu")
     deviation = linear(state, "fc_logstd") if "fc_logstd.weight" in state else None
 
@@ -181,6 +205,8 @@ def _off_policy(state: State, activation: str) -> Network:
 
 def stable_baselines3(state: State, told: Told) -> Network:
     """``MlpPolicy`` and ``MlpLstmPolicy`` on one row of numbers, of PPO, A2C, TRPO, SAC, TQC, TD3, DDPG, DQN, QRDQN."""
+    import torch
+
     family, activation = told["family"], told["activation"]
     low, high = torch.tensor(told["low"]), torch.tensor(told["high"])
     limit = told["limit"]
@@ -222,7 +248,7 @@ def stable_baselines3(state: State, told: Told) -> Network:
             return {"action": bounded(mean + _noise(feeds, mean) * log_std.clamp(-20, 2).exp())}
 
         return draw
-    memory = Memory(state, "lstm_actor") if "lstm_actor.weight_ih_l0" in state else None
+    memory = RecurrentLayer(state, "lstm_actor") if "lstm_actor.weight_ih_l0" in state else None
     trunks = [sequence(state, f"mlp_extractor.{part}", activation) for part in ("shared_net", "policy_net")]
     head = linear(state, "action_net")
 
@@ -246,9 +272,11 @@ def stable_baselines3(state: State, told: Told) -> Network:
 
 def mlagents(state: State, told: Told) -> Network:
     """``SimpleActor`` of 0.26 to 1.1 on rows of numbers, each normalised or not, with its LSTM."""
+    import torch
+
     normalisers = [_of(state, f"{module}.normalizer") if module else {} for module in told["sensors"]]
     body = sequence(state, told["body"], "silu")
-    memory = Memory(state, "network_body.lstm.lstm") if "network_body.lstm.lstm.weight_ih_l0" in state else None
+    memory = RecurrentLayer(state, "network_body.lstm.lstm") if "network_body.lstm.lstm.weight_ih_l0" in state else None
     kinds = "action_model._continuous_distribution", "action_model._discrete_distribution"
     has_mean = f"{kinds[0]}.mu.weight" in state
     mean_layer = linear(state, f"{kinds[0]}.mu") if has_mean else None
@@ -276,7 +304,7 @@ def mlagents(state: State, told: Told) -> Network:
         masks = feeds["action_masks"].split([b.out_features for b in branches], 1) if branches else ()
         for i, (branch, mask) in enumerate(zip(branches, masks, strict=True)):
             logits = branch(x) * mask - 1e8 * (1 - mask)
-            answers[f"logits_{i}"] = torch.log(functional.softmax(logits, -1))
+            answers[f"logits_{i}"] = torch.log(torch.softmax(logits, -1))
         return answers
 
     return act

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import torch
+if TYPE_CHECKING:
+    import torch
 
 
 class ScriptedModule:
@@ -17,11 +18,15 @@ class ScriptedModule:
     """
 
     def __init__(self, path: str, inputs: Sequence[Any], buffers: Sequence[Any], states: Sequence[str]) -> None:
+        import torch
+
         self._module = torch.jit.load(path, map_location="cpu").eval()
         self._inputs, self._buffers, self._states = inputs, buffers, states
 
     def __call__(self, feeds: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
         """Return the outputs by the names that the reader of the file gives them, and the memory after."""
+        import torch
+
         feeds = dict(feeds)
         shapes = dict(self._inputs)
         parts = [(name, shapes[name]) for name in self._states] + list(self._buffers)
