@@ -76,7 +76,7 @@ def _of_urdf(root: Element) -> Iterator[PlacedJoint]:
         if joint.get("type") in _URDF_MOVES and joint.find("mimic") is None:
             axis = _numbers(joint.find("axis"), "xyz", (1, 0, 0))
             above_here, above = above, joint.get("name", "")
-            yield _placed(above, above_here, frame, (0, 0, 0), axis, str(joint.get("type")))
+            yield _place_in(above, above_here, frame, (0, 0, 0), axis, str(joint.get("type")))
         waiting += [(j, above, frame) for j in reversed(below.get(_link(joint, "child"), []))]
 
 
@@ -117,7 +117,7 @@ def _of_mjcf(root: Element) -> Iterator[PlacedJoint]:
                 raise ValueError(f"joint {short_text(stated.get('name', ''))!r} is a ball: it has three numbers")
             axis, place = _vector(stated, "axis", (0, 0, 1)), _vector(stated, "pos", (0, 0, 0))
             above_here, above = above, stated.get("name", "")
-            yield _placed(above, above_here, frame, place, axis, kind)
+            yield _place_in(above, above_here, frame, place, axis, kind)
         waiting += [(b, above, inherited, frame) for b in reversed(body.findall("body"))]
 
 
@@ -139,14 +139,14 @@ def _turn(body: Element, unit: float) -> np.ndarray:
         return turn
     if body.get("axisangle"):
         *axis, angle = _numbers(body, "axisangle", (0, 0, 1, 0))
-        return _turned(_unit(np.array(axis)), unit * angle)
+        return _rotation(_unit(np.array(axis)), unit * angle)
     return _of_quaternion(_unit(np.array(_numbers(body, "quat", (1, 0, 0, 0)))))
 
 
 # ------------------------------------------------------------------ frames
 
 
-def _placed(
+def _place_in(
     name: str, above: str, frame: np.ndarray, place: tuple[float, ...], axis: tuple[float, ...], kind: str
 ) -> PlacedJoint:
     turned = frame[:3, :3] @ _unit(np.array(axis, float))
@@ -178,10 +178,10 @@ def _unit(vector: np.ndarray) -> np.ndarray:
 
 
 def _about(axis: str, angle: float) -> np.ndarray:
-    return _turned(np.array([float(letter == axis) for letter in "xyz"]), angle)
+    return _rotation(np.array([float(letter == axis) for letter in "xyz"]), angle)
 
 
-def _turned(axis: np.ndarray, angle: float) -> np.ndarray:
+def _rotation(axis: np.ndarray, angle: float) -> np.ndarray:
     half = angle / 2
     return _of_quaternion(np.array([math.cos(half), *(math.sin(half) * axis)]))
 

@@ -74,7 +74,7 @@ def _rebuild(saved: Saved, folder: Path) -> Rebuilt:
             x = _layer_norm(net, recipe.activation(net, x), f"{layers}.LayerNorm_{index}")
     x = x if squashed else _dense(net, x, "policy.Dense_0")
     net.at("action")
-    net.output("action", net.add("Tanh", [_means(net, x)]) if squashed else _clipped(net, x, recipe.clip_scale))
+    net.output("action", net.add("Tanh", [_means(net, x)]) if squashed else _clip_mean(net, x, recipe.clip_scale))
     weights.forget("normaliser.", *_DEVIATIONS)
     weights.check_all_read()
     facts = SourceFacts(
@@ -97,7 +97,7 @@ def _recipe(saved: Saved, folder: Path, weights: Weights) -> _Recipe:
     """Return what brax' configuration says, or else the user. Raises SourceError where neither does, UsageError."""
     for name, algorithm in CONFIGS.items():
         if (folder / name).is_file():
-            return _written(saved, folder / name, algorithm)
+            return _recipe_of(saved, folder / name, algorithm)
     plain = _is_untouched(saved, weights)
     if saved.script is not None and saved.script not in _SCRIPTS:
         raise UsageError(f"--script {saved.script}: unknown script of brax", fix=f"one of: {', '.join(_SCRIPTS)}")
@@ -114,7 +114,7 @@ def _recipe(saved: Saved, folder: Path, weights: Weights) -> _Recipe:
     )
 
 
-def _written(saved: Saved, file: Path, algorithm: str) -> _Recipe:
+def _recipe_of(saved: Saved, file: Path, algorithm: str) -> _Recipe:
     """Return what a configuration of brax says. Raises SourceError, UsageError where an option says it again."""
     for option in ("activation", "script"):
         if getattr(saved, option) is not None:
@@ -214,7 +214,7 @@ def _means(net: Network, x: str) -> str:
     return net.slice(x, 1, 0, net.width(x) // 2)
 
 
-def _clipped(net: Network, mean: str, scale: float | None) -> str:
+def _clip_mean(net: Network, mean: str, scale: float | None) -> str:
     """scale·mean/(1 + |mean|); the mean where there is no scale."""
     if scale is None:
         return mean

@@ -55,7 +55,7 @@ READING = (
     Row(
         "interface",
         "--interface",
-        "YAML with the interface (default: the one next to the source), or none.",
+        "YAML with the interface, or none (default: the one beside).",
         "FILE",
         FILE,
     ),

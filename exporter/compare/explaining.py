@@ -36,7 +36,7 @@ _EPISODES, _STEPS = 16, 16
 
 
 #: kind of a cause → what it does, after the tensor that it is done to.
-_CHANGES = {
+CHANGES = {
     "memory": "used otherwise",
     "previous_action": "left out",
     "mask": "read otherwise",
@@ -135,7 +135,7 @@ def _explanations(
     for side, other in (("candidate", "reference"), ("reference", "candidate")):
         answered = [s.name for s in signature.outputs] if other == "reference" else participant.outputs
         try:
-            found = _explain(signature, _bounded(runs[other]), answered, logs[side], heads)
+            found = _explain(signature, _bound_trials(runs[other]), answered, logs[side], heads)
         except _WorkDoneError:
             yield side, other, None
             continue
@@ -144,7 +144,7 @@ def _explanations(
             return
 
 
-def _bounded(run: Run) -> Run:
+def _bound_trials(run: Run) -> Run:
     """A run that raises _WorkDoneError after ``_MOST_RUNS`` or ``_MOST_ROWS``."""
     runs, rows = 0, 0
 
@@ -163,7 +163,7 @@ def _phrases(found: Explanation, side: str, other: str) -> Iterator[str]:
     for cause in found.causes:
         others = [c.where for c in found.others if c.kind == cause.kind][:2]
         also = f", or {', '.join(others)}" if others else ""
-        yield f"{cause.where} {_CHANGES[cause.kind]} ({in_sides(cause.says, side, other)}{also})"
+        yield f"{cause.where} {CHANGES[cause.kind]} ({in_sides(cause.says, side, other)}{also})"
 
 
 def in_sides(sentence: str, log: str, other: str) -> str:

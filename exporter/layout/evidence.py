@@ -48,7 +48,7 @@ def evidence_of(trial: Trial, layout: Layout) -> Iterator[Evidence]:
     if trial.mean is not None and trial.deviation is not None:
         yield from _of_normaliser(trial.mean, trial.deviation, places, alike)
     elif len(alike) > 1:
-        yield from _of_steps({name: _moved(trial, numbers) for name, numbers in alike.items()})
+        yield from _of_steps({name: _move(trial, numbers) for name, numbers in alike.items()})
     if layout.frames > 1:
         yield from _of_frames(trial, layout)
     yield from _of_bounds(trial)
@@ -91,7 +91,7 @@ def _of_frames(trial: Trial, layout: Layout) -> Iterator[Evidence]:
     ends = [
         np.concatenate([at.reshape(layout.frames, -1)[end] for at in places_of(layout).values()]) for end in (0, -1)
     ]
-    first, last = (_moved(trial, numbers) for numbers in ends)
+    first, last = (_move(trial, numbers) for numbers in ends)
     if max(first, last) >= _STEERS * min(first, last) > 0:
         newest, ratio = ("first", first / last) if first > last else ("last", last / first)
         yield Evidence(NEWEST, True, f"the {newest} frame moves the action {ratio:.1f} times as much as the other end")
@@ -106,7 +106,7 @@ def _of_bounds(trial: Trial) -> Iterator[Evidence]:
         yield Evidence(SCALES, True, f"the action stays within ±{bound:.3g} however large the observation is")
 
 
-def _moved(trial: Trial, numbers: np.ndarray) -> float:
+def _move(trial: Trial, numbers: np.ndarray) -> float:
     """How far the action moves, for a random step of each of some numbers."""
     base = trial.observations[:, :_ROWS]
     signs = np.random.default_rng(3).choice([-1.0, 1.0], (1, base.shape[1], len(numbers)))

@@ -178,8 +178,8 @@ def test_the_error_says_what_is_wrong(change: object, words: str) -> None:
     [
         (Dataset("k", (1, 1, 1, 3), 0, 4, 2), "does not have its 2 elements"),
         (Dataset("k", (1, 1, 1, -2), 0, 4, -2), "does not have its -2 elements"),
-        (Dataset("k", (1, 1, 1, 2), 1, 4, 2), "lies at 1 to 3"),
-        (Dataset("k", (1, 1, 1, 2), -1, 4, 2), "lies at -1 to 1"),
+        (Dataset("k", (1, 1, 1, 2), 1, 4, 2), "is at 1 to 3"),
+        (Dataset("k", (1, 1, 1, 2), -1, 4, 2), "is at -1 to 1"),
         (Dataset("k", (1, 1, 1, 2), 0, 2, 2), "have 2 bytes"),
         (Dataset("k", (2**31 - 1,) * 4, 0, 4, 2**31 - 1), "does not have its 2147483647 elements"),
         (Dataset("k", (1, 1, 1, 2**31 - 1), 0, 4, 2**31 - 1), "the file ends inside the weights"),

@@ -101,7 +101,7 @@ def test_missing_and_short_shards_are_named(tmp_path: Path) -> None:
     shard = tmp_path / "m.data-00000-of-00001"
     shard.write_bytes(shard.read_bytes()[:500])
     np.testing.assert_array_equal(Checkpoint(tmp_path / "m").read("a"), values["a"])
-    with pytest.raises(DamagedFileError, match=r"'b' lies beyond the end of the file") as caught:
+    with pytest.raises(DamagedFileError, match=r"'b' is beyond the end of the file") as caught:
         Checkpoint(tmp_path / "m").read("b")
     assert caught.value.where == shard.name
     shard.unlink()

@@ -394,7 +394,7 @@ def test_the_command_line_compares_and_reports(bundles: Bundles, tmp_path: Path)
     read = ("--map", "action=Identity", "--input", "action_masks=masks", "--max-size", "1MB")
     right = export_model(*command, *read, "--json", "--html", tmp_path / "p.html")
     assert right.status == 0
-    again = (tmp_path / "p.html").read_text().partition("To compare again")[2].partition("</p>")[0]
+    again = (tmp_path / "p.html").read_text().partition("To compare again")[2].partition("</code>")[0]
     assert all(f"{flag} {value}" in again for flag, value in zip(read[::2], read[1::2], strict=True))
     assert "--json" not in again
     (report,) = right.json["reports"]

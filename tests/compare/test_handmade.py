@@ -151,11 +151,10 @@ def valued(name: str = "value_estimate", sign: float = 1.0) -> list[NodeDef]:
     ]
 
 
-def test_an_output_that_is_missing_is_a_failure(tmp_path: Path) -> None:
+def test_another_makers_file_may_leave_a_value_out(tmp_path: Path) -> None:
+    """That both call an action "action" tells no maker; test_comparison.py drops an output of one maker's file."""
     report = compared(tmp_path, valued(), OURS)
-    (missing,) = report.failures
-    assert (missing.kind, missing.output, missing.passed) == ("failure", "value_estimate", False)
-    assert missing.reason.startswith("missing output 'value_estimate'; there are ")
+    assert report.passed is True and "value_estimate" not in {c.output for c in report.comparisons}
     extra = compared(tmp_path, OURS, valued())
     assert extra.passed is True, "more than the reference has"
 

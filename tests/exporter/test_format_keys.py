@@ -14,8 +14,9 @@ from tests.exporter.test_imports import MODULES, ROOT, name_of
 #: Words of this project's own: others, such as ``c``, ``js`` and ``bytes``, are runtimes, units and languages, too.
 KEYS = WRITTEN.keys() - {r.name for r in RUNTIMES} - {"bytes", "js"}
 #: Files that may still name one: the protocol of TensorFlow's two children, the runtimes' names in a browser, and words
-#: that stand for something else (a field of site.json and its readers, the name of a snippet, TensorFlow's own module).
-MOST = 8
+#: that stand for something else (a field of site.json and its readers, the name of a snippet, TensorFlow's own module,
+#: what users of other tools type).
+MOST = 9
 #: Files beside Python that say something to a program: scripts, pages, templates of snippets and of compiled children.
 CODE = {".mjs", ".js", ".html", ".tmpl", ".cs", ".c", ".h", ".sh"}
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -58,7 +59,7 @@ def test_a_bundle_is_read(place: str, bundle: Path, tmp_path: Path, monkeypatch:
     assert ran.status == 0, ran.err + ran.out
     load_policy(given, runtime="onnxruntime")
     for of in ("tfjs", "tfjs/model.json", "saved_model", "saved_model/saved_model.pb", "continuous.onnx"):
-        is_read(given / of, tmp_path / of.replace("/", "-"))
+        is_read(given / of, tmp_path / re.sub("[/.]", "-", of))
     is_read(given, tmp_path / "out")
     monkeypatch.chdir(given)
     is_read(Path(), tmp_path / "here")

@@ -104,7 +104,7 @@ def test_no_report_of_an_earlier_run_is_left(
 
 def test_the_reports_of_an_export_say_how_it_was_judged(exporting: Exporting, tmp_path: Path) -> None:
     assert exporting("--html", tmp_path / "h.html", "--atol", "0.5", "--max-size", "1GB").status == 0
-    again = (tmp_path / "h.html").read_text(encoding="utf-8").partition("To compare again")[2].partition("</p>")[0]
+    again = (tmp_path / "h.html").read_text(encoding="utf-8").partition("To compare again")[2].partition("</code>")[0]
     assert "--atol 0.5" in again and "--max-size 1GB" in again
 
 

@@ -11,11 +11,12 @@ import pytest
 from msgspec.structs import replace
 
 from export_model.converters.formats.bundle.bundle import dumps
+from export_model.exporter.compare import explaining
 from export_model.exporter.verify import findings
 from export_model.exporter.verify.excuses import NOT_FROM_ZERO, ROUNDING, Forgiven
 from export_model.exporter.verify.findings import Bisection, Finding
 from export_model.exporter.verify.plays import VERDICTS, Interval, Player, PlayRecord
-from export_model.exporter.verify.report import ParityReport
+from export_model.exporter.verify.report import ParityReport, SideCause
 from export_model.exporter.verify.tolerances import Tolerance
 from tests.reports.made import BEGINNING, FAILING, PASSING, UNVERIFIED, comparison
 from tests.reports.validation import check_parity, schema
@@ -62,6 +63,11 @@ REPORTS = [
             replace(WHOLE, bisection=replace(BEGINNING, source=("a:0", "b:0"), got=float("-inf"))),
         ),
         whole_sizes={"onnx": 4000},
+        causes=tuple(
+            SideCause("onnx", side, kind, "column 1", "a sentence")
+            for kind in explaining.CHANGES
+            for side in ("candidate", "reference")
+        ),
         played=tuple(
             PlayRecord(
                 environment="Walk",

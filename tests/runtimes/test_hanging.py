@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -82,3 +83,31 @@ def test_an_h5_that_keeps_its_library_busy_is_refused(
     with pytest.raises(DamagedFileError) as refused:
         children.stored_in(tmp_path / "policy.h5")
     assert "of computing are enough" in (refused.value.why or "")
+
+
+def test_a_model_that_is_collected_in_the_middle_of_an_answer_is_freed_with_the_next_request(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A collector's run there read another model's answer as its own, and the process was taken for broken."""
+    sent: list[str] = []
+    model = tmp_path / "model"
+    model.touch()
+    read, write = process.read_frame, process.write_frame
+
+    def collect(*given: Any) -> Any:
+        if sent[-1] == "run":
+            first.unload()
+        return read(*given)
+
+    def note(stream: Any, header: Any, *tensors: Any) -> None:
+        sent.append(header["cmd"])
+        write(stream, header, *tensors)
+
+    with RuntimeProcess("quick", [sys.executable, "-c", _PROGRAM, "", "0"]) as quick:
+        first, second = quick.load(str(model)), quick.load(str(model))
+        monkeypatch.setattr(process, "read_frame", collect)
+        monkeypatch.setattr(process, "write_frame", note)
+        second.run({}, [])
+        assert sent == ["run"]
+        quick.request({"cmd": "hello"})
+        assert sent == ["run", "unload", "hello"]

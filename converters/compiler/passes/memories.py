@@ -82,7 +82,7 @@ def _reasons(
         why = "its name and shape agree with those of {}" if known is None or known.role is None else known.says
         why = "the user says so" if options.inputs.get(memory.input) is Role.MEMORY_IN else why
         said.append(f"{origins[memory.input]}: {why.format(origins[memory.output])}")
-    text = f"it stands for {'; '.join(said)}"
+    text = f"it is made of {'; '.join(said)}"
     taken, given = made
     return {
         taken: RoleDecision(taken, Role.MEMORY_IN, text),

@@ -57,7 +57,7 @@ def name_for_px4(policy: Policy) -> Policy:
         dressing.refuse(
             "it has a memory",
             why="mc_nn_control feeds one row of numbers, and keeps none",
-            fix="train without memory, or take --to litert or --to c into a module of your own",
+            fix="train without memory, or take --to litert or --to c into another module",
         )
     _take_row(dressing)
     _give_mean(dressing, "mc_nn_control takes a number for each of four motors", LITERT.key)

@@ -98,6 +98,8 @@ class RuntimeProcess(AbstractContextManager["RuntimeProcess"]):
         self._asked = 0.0
         self._closed = threading.Event()
         self._memory: ChildMemory | None = None
+        #: models to free, by identity and bytes, as soon as the request that is under way is answered
+        self._to_free: list[tuple[str, int]] = []
         self._loaded = 0
         self._timed_out = timed_out
         #: the model that has not answered yet, the processor time at which the process is stopped, how much that gives
@@ -207,8 +209,17 @@ class RuntimeProcess(AbstractContextManager["RuntimeProcess"]):
             self._first = None
 
     def unload(self, identity: str, size: int) -> None:
-        """Free a model of that many bytes."""
-        self.request({"cmd": "unload", "id": identity})
+        """Free a model of that many bytes; with the next request, where one is under way.
+
+        What holds a model may be collected at any moment, in the middle of reading another model's answer, too.
+        """
+        if self._busy:
+            self._to_free.append((identity, size))
+            return
+        self._free(identity, size)
+
+    def _free(self, identity: str, size: int) -> None:
+        self._exchange(lambda stream: write_frame(stream, {"cmd": "unload", "id": identity}))
         self._take_back(identity, size)
 
     def request(
@@ -218,6 +229,8 @@ class RuntimeProcess(AbstractContextManager["RuntimeProcess"]):
 
         Raises RunFailedError where the answer is an error, the process died, or hangs.
         """
+        while self._to_free:
+            self._free(*self._to_free.pop())
         if self._memory is not None:
             self._memory.allow_for_request(sum(a.nbytes for a in (tensors or {}).values()))
         return self._exchange(lambda stream: write_frame(stream, header, tensors))
@@ -302,7 +315,7 @@ class RuntimeProcess(AbstractContextManager["RuntimeProcess"]):
         self.hang_up()
         self._closed.set()
         process, ready = self._process, self.version is not None and not self._busy
-        self._process, self.version, self._busy = None, None, False
+        self._process, self.version, self._busy, self._to_free = None, None, False, []
         if process is not None:
             if not ready:
                 _end(process, kill=False)  # one that has started a browser ends that first

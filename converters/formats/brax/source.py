@@ -46,7 +46,7 @@ def read(given: Fetched, options: ReadOptions) -> list[SourceModel]:
         **{f"normaliser.{name}": value[0].attribute(name) for name in _STATISTICS},
         "policy": _mapping_of(value[1]).get("params"),
     }
-    return _rebuilt(given, options, dict(_arrays(parts)), given.path.parent, (given.path,), len(value) > 2)
+    return _rebuild_policy(given, options, dict(_arrays(parts)), given.path.parent, (given.path,), len(value) > 2)
 
 
 def read_folder(given: Fetched, options: ReadOptions) -> list[SourceModel]:
@@ -57,10 +57,10 @@ def read_folder(given: Fetched, options: ReadOptions) -> list[SourceModel]:
     starts = {"0.mean": "normaliser.mean", "0.std": "normaliser.std", "1.params": "policy"}
     arrays, files = read_arrays(given, tuple(starts))
     named = {starts[".".join(n.split(".")[:2])] + n[len(".".join(n.split(".")[:2])) :]: a for n, a in arrays.items()}
-    return _rebuilt(given, options, named, given.path, files, critic=False)
+    return _rebuild_policy(given, options, named, given.path, files, critic=False)
 
 
-def _rebuilt(
+def _rebuild_policy(
     given: Fetched,
     options: ReadOptions,
     arrays: Mapping[str, np.ndarray],

@@ -60,7 +60,7 @@ def _set(node: Any, name: str, **value: Any) -> None:
     node.attribute.add(name=name, **value)
 
 
-def _moved(node: Any, op: str, *operands: str) -> Any:
+def _move(node: Any, op: str, *operands: str) -> Any:
     """A node of ``op`` that makes the output of ``node`` of what that gave so far, which gets a name of its own."""
     made = type(node)(op_type=op, name=f"{node.output[0]}/repaired", output=[node.output[0]])
     node.output[0] = f"{node.output[0]}/as_exported"
@@ -120,7 +120,7 @@ def _divide(nodes: Mapping[str, Any], node: Any, shapes: Shapes) -> Sequence[Any
         )
     _set(node, "count_include_pad", i=1, type=_INT)
     factor = _constant(node, name="value_float", f=_window(node) / _divisor(node), type=_FLOAT)
-    return factor, _moved(node, "Mul", factor.output[0])
+    return factor, _move(node, "Mul", factor.output[0])
 
 
 def _mixes_channels(node: Any, shapes: Shapes) -> bool:
@@ -132,7 +132,7 @@ def _order_channels(nodes: Mapping[str, Any], node: Any, shapes: Shapes) -> Sequ
     channels, places = shapes[node.input[0]][1], _integer(node, "blocksize", 1) ** 2
     order = [place * channels + channel for channel in range(channels) for place in range(places)]
     table = _constant(node, name="value_ints", ints=order, type=_INTS)
-    gather = _moved(node, "Gather", table.output[0])
+    gather = _move(node, "Gather", table.output[0])
     gather.attribute.add(name="axis", i=1, type=_INT)
     return table, gather
 

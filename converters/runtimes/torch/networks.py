@@ -21,14 +21,6 @@ State = dict[str, Any]
 Network = Callable[[State], State]
 Told = Mapping[str, Any]
 
-#: What --activation calls them → their classes in torch.nn.
-ACTIVATIONS: Mapping[str, str] = {
-    kind.lower(): kind
-    for kind in (
-        *("ReLU", "Tanh", "Sigmoid", "Softplus", "Softsign", "ELU", "SELU", "CELU", "GELU", "SiLU", "Mish"),
-        *("LeakyReLU", "ReLU6", "Hardtanh", "Hardsigmoid", "Hardswish", "LogSigmoid", "Identity"),
-    )
-}
 #: How the name of what a normal draw is fed as ends.
 _NOISE = "RandomStandardNormal"
 
@@ -37,7 +29,7 @@ def _of(state: State, module: str) -> State:
     return {n.removeprefix(f"{module}."): t for n, t in state.items() if n.startswith(f"{module}.")}
 
 
-def _loaded(layer: nn.Module, state: State, module: str) -> nn.Module:
+def _load(layer: nn.Module, state: State, module: str) -> nn.Module:
     layer.load_state_dict(_of(state, module))
     return layer.eval()
 
@@ -46,8 +38,11 @@ def activation_layer(name: str) -> nn.Module:
     """The layer that ``--activation`` names."""
     from torch import nn
 
-    layer: nn.Module = getattr(nn, ACTIVATIONS[name])()
-    return layer
+    kinds: tuple[type[nn.Module], ...] = (
+        *(nn.ReLU, nn.Tanh, nn.Sigmoid, nn.Softplus, nn.Softsign, nn.ELU, nn.SELU, nn.CELU, nn.GELU, nn.SiLU, nn.Mish),
+        *(nn.LeakyReLU, nn.ReLU6, nn.Hardtanh, nn.Hardsigmoid, nn.Hardswish, nn.LogSigmoid, nn.Identity),
+    )
+    return next(kind() for kind in kinds if kind.__name__.lower() == name)
 
 
 def linear(state: State, module: str) -> nn.Module:
@@ -55,7 +50,7 @@ def linear(state: State, module: str) -> nn.Module:
     from torch import nn
 
     out, width = state[f"{module}.weight"].shape
-    return _loaded(nn.Linear(width, out, bias=f"{module}.bias" in state), state, module)
+    return _load(nn.Linear(width, out, bias=f"{module}.bias" in state), state, module)
 
 
 def sequence(state: State, module: str, activation: str = "tanh", *, ends: bool = False) -> nn.Sequential:
@@ -69,7 +64,7 @@ def sequence(state: State, module: str, activation: str = "tanh", *, ends: bool 
         if place not in places:
             layers.append(activation_layer(activation))
         elif state[f"{name}.weight"].ndim == 1:
-            layers.append(_loaded(nn.LayerNorm(len(state[f"{name}.weight"])), state, name))
+            layers.append(_load(nn.LayerNorm(len(state[f"{name}.weight"])), state, name))
         else:
             layers.append(linear(state, name))
     if places and not ends:
@@ -87,7 +82,7 @@ class RecurrentLayer:
         self._layers = sum(n.startswith("weight_hh_l") for n in _of(state, module))
         kind = nn.LSTM if self._rows == 4 * self._hidden else nn.GRU
         width = state[f"{module}.weight_ih_l0"].shape[1]
-        self._module = _loaded(kind(width, self._hidden, self._layers), state, module)
+        self._module = _load(kind(width, self._hidden, self._layers), state, module)
 
     def __call__(self, x: torch.Tensor, memory: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the output of one step, and the memory after it."""
@@ -211,7 +206,7 @@ def stable_baselines3(state: State, told: Told) -> Network:
     low, high = torch.tensor(told["low"]), torch.tensor(told["high"])
     limit = told["limit"]
 
-    def bounded(mean: torch.Tensor) -> torch.Tensor:
+    def bound_action(mean: torch.Tensor) -> torch.Tensor:
         if told["squashed"]:
             return low + 0.5 * (torch.tanh(mean) + 1) * (high - low)
         return torch.maximum(torch.minimum(mean, high), low)
@@ -237,7 +232,7 @@ def stable_baselines3(state: State, told: Told) -> Network:
         return value
     if family == "actor":
         actor = sequence(state, "actor.mu", activation, ends=True)
-        return lambda feeds: {"action": bounded(actor(observe(feeds)))}
+        return lambda feeds: {"action": bound_action(actor(observe(feeds)))}
     if family == "gaussian_actor":
         latent = sequence(state, "actor.latent_pi", activation)
         heads = [linear(state, f"actor.{name}") for name in ("mu", "log_std")]
@@ -245,7 +240,7 @@ def stable_baselines3(state: State, told: Told) -> Network:
         def draw(feeds: State) -> State:
             x = latent(observe(feeds))
             mean, log_std = (head(x) for head in heads)
-            return {"action": bounded(mean + _noise(feeds, mean) * log_std.clamp(-20, 2).exp())}
+            return {"action": bound_action(mean + _noise(feeds, mean) * log_std.clamp(-20, 2).exp())}
 
         return draw
     memory = RecurrentLayer(state, "lstm_actor") if "lstm_actor.weight_ih_l0" in state else None
@@ -262,7 +257,7 @@ def stable_baselines3(state: State, told: Told) -> Network:
         if "log_std" not in state:
             parts = out.split(told["branches"], 1)
             return {**answers, **{f"logits_{i}": part for i, part in enumerate(parts)}}
-        return {**answers, "action": bounded(out + _noise(feeds, out) * state["log_std"].exp())}
+        return {**answers, "action": bound_action(out + _noise(feeds, out) * state["log_std"].exp())}
 
     return act
 
