@@ -15,6 +15,7 @@ AT_HOME = (
     "converters/runtimes/litert/",
     "converters/runtimes/openvino/",
     "converters/graph/ops/",
+    "converters/consumers/robots/",  # PX4 is built with such a file, and asks what its operators are
 )
 #: Written by npm, and by the program that lists what npm installed.
 WRITTEN_BY_TOOLS = ("package-lock.json", "installed.json")
