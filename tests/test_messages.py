@@ -58,5 +58,6 @@ def test_a_policy_is_read_and_written_in_either(
     first = python("-m", "export_model", ROOT / "fixtures" / "continuous.bytes", "-o", tmp_path, "--verify", "none")
     assert first.status == 0, first.err
     for name in ("continuous.onnx", "saved_model"):
-        again = python("-m", "export_model", tmp_path / "continuous" / name, "-o", tmp_path / name, "--verify", "none")
+        out = tmp_path / "again" / Path(name).stem
+        again = python("-m", "export_model", tmp_path / "continuous" / name, "-o", out, "--verify", "none")
         assert again.status == 0, again.err

@@ -188,7 +188,7 @@ def test_a_checkpoint_of_skrl_1_calls_observations_states(tmp_path: Path) -> Non
 
 
 def test_a_checkpoint_of_skrl_without_settings_names_what_is_missing(tmp_path: Path) -> None:
-    with pytest.raises(SourceError, match=r"its agent\.yaml is missing(?s:.*)a class of its own"):
+    with pytest.raises(SourceError, match=r"its agent\.yaml is missing(?s:.*)a custom class"):
         read_source(checkpoint(tmp_path, "skrl_ppo", settings=""))
 
 
