@@ -110,7 +110,9 @@ def _recipe(saved: Saved, folder: Path, weights: Weights) -> _Recipe:
         )
     normalised = _SCRIPTS.get(saved.script or "brax-raw", False)
     return _Recipe(
-        _jax_activation(saved.activation), normalised, said_by="--script" if saved.script else "an unused normaliser"
+        _jax_activation(saved.activation),
+        normalised,
+        said_by="--script" if saved.script else "an empty normaliser",
     )
 
 

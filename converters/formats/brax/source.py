@@ -26,6 +26,8 @@ from export_model.signatures.errors import DamagedFileError
 _MAX_DEPTH, _MAX_ARRAYS = 8, 10_000
 #: What brax writes beside the arrays, of PPO and of SAC.
 _CONFIG = "*_network_config.json"
+#: How orbax calls the parts of that tuple, and how they are called here.
+_PARTS = {"0.mean": "normaliser.mean", "0.std": "normaliser.std", "1.params": "policy"}
 _STATISTICS = ("mean", "std")
 
 
@@ -54,9 +56,8 @@ def read_folder(given: Fetched, options: ReadOptions) -> list[SourceModel]:
 
     Raises RuntimeUnavailableError without tensorstore, DamagedFileError, and what ``trainers.brax`` raises.
     """
-    starts = {"0.mean": "normaliser.mean", "0.std": "normaliser.std", "1.params": "policy"}
-    arrays, files = read_arrays(given, tuple(starts))
-    named = {starts[".".join(n.split(".")[:2])] + n[len(".".join(n.split(".")[:2])) :]: a for n, a in arrays.items()}
+    arrays, files = read_arrays(given, tuple(_PARTS))
+    named = {f"{_PARTS[s]}{n.removeprefix(s)}": a for n, a in arrays.items() for s in _PARTS if n.startswith(s)}
     return _rebuild_policy(given, options, named, given.path, files, critic=False)
 
 

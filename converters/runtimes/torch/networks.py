@@ -42,7 +42,10 @@ def activation_layer(name: str) -> nn.Module:
         *(nn.ReLU, nn.Tanh, nn.Sigmoid, nn.Softplus, nn.Softsign, nn.ELU, nn.SELU, nn.CELU, nn.GELU, nn.SiLU, nn.Mish),
         *(nn.LeakyReLU, nn.ReLU6, nn.Hardtanh, nn.Hardsigmoid, nn.Hardswish, nn.LogSigmoid, nn.Identity),
     )
-    return next(kind() for kind in kinds if kind.__name__.lower() == name)
+    for kind in kinds:
+        if kind.__name__.lower() == name:
+            return kind()
+    raise RuntimeError(f"--activation {name} is not known here")
 
 
 def linear(state: State, module: str) -> nn.Module:
